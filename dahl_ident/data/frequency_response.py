@@ -242,16 +242,11 @@ class FrequencyResponse(Tabular):
         ('backbone', [0.02, 0.03])
         """
         frequency = positive_array(natural_frequency_hz, "natural_frequency_hz")
-        stds = [
-            np.broadcast_to(positive_array(values, name), frequency.shape)
-            for name, values in (
-                ("frequency_std", frequency_std),
-                ("damping_ratio_std", damping_ratio_std),
-            )
-        ]
+        of_frequency = positive_array(frequency_std, "frequency_std")
+        of_damping = positive_array(damping_ratio_std, "damping_ratio_std")
         covariance = np.zeros((*frequency.shape, 2, 2))
-        covariance[..., 0, 0] = (stds[0] / frequency) ** 2
-        covariance[..., 1, 1] = stds[1] ** 2
+        covariance[..., 0, 0] = (of_frequency / frequency) ** 2
+        covariance[..., 1, 1] = of_damping**2
         return cls(
             frequency,
             1j * non_negative_array(damping_ratio, "damping_ratio"),

@@ -27,7 +27,12 @@ from dahl_ident.arrays import TINY, FloatArray
 from dahl_ident.diagnostics.error_model import error_model
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.information import Information, parameter_values, values_at
-from dahl_ident.diagnostics.physics import is_spring, negative_parameters
+from dahl_ident.diagnostics.physics import (
+    OF_FRICTION,
+    friction_quantities,
+    is_spring,
+    negative_parameters,
+)
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.record_channels import RELATIVE_STEP
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
@@ -35,7 +40,6 @@ from dahl_ident.diagnostics.verdicts import NOT_IDENTIFIED_ABOVE
 from dahl_ident.elements import (
     Damper,
     Element,
-    Friction,
     Mass,
     Model,
     Parameter,
@@ -46,7 +50,7 @@ from dahl_ident.elements.element import Alternative, as_model
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
-from dahl_ident.units import percent, si_unit
+from dahl_ident.units import percent
 
 _RISE_BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
 _ASTRAY = 0.5  # misfit above which a search has failed
@@ -59,8 +63,6 @@ _UNUSUAL = 5.0  # factor beyond the usual range of an exponent that no mechanism
 _DISAGREE = 0.2  # relative difference of force limits or stiffnesses that matters to the user
 _PLACES = 6  # decimals of a change: less is rounding
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
-_OF_FRICTION = "force limit", "stiffness at zero force"  # the same in all laws
-_TABULATED = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
 @dataclass(frozen=True)
@@ -142,10 +144,12 @@ class ComparedModel:
         a law never slips, NaN where these data do not determine it.
         """
         problem = self.optimum.problem
-        quantities = _meaning(problem, parameter_values(self.optimum))
+        quantities = friction_quantities(problem, parameter_values(self.optimum))
         undetermined = _undetermined(self.optimum, quantities)
         if self.stated is not None:
-            quantities = _meaning(problem, {name: p.value for name, p in self.stated.items()})
+            quantities = friction_quantities(
+                problem, {name: p.value for name, p in self.stated.items()}
+            )
         return quantities | dict.fromkeys(undetermined, np.nan)
 
     @property
@@ -236,7 +240,7 @@ class ModelComparison:
     def _is_sound(self, model: ComparedModel) -> bool:
         """Return whether a model is the one that was fitted, or physical and determined."""
         fitted = self.models[0]
-        sizes = [(model.meaning[k], fitted.meaning[k]) for k in _OF_FRICTION]
+        sizes = [(model.meaning[k], fitted.meaning[k]) for k in OF_FRICTION]
         runs_away = any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
         is_sound = model.is_physical and not runs_away and model.is_determined
         return model is fitted or is_sound
@@ -289,7 +293,7 @@ class ModelComparison:
         lines = []
         for m in self.models:
             gain, error = m.density.gain_over(first.density)
-            changes = [_change(m.meaning[key], first.meaning[key]) for key in _OF_FRICTION]
+            changes = [_change(m.meaning[key], first.meaning[key]) for key in OF_FRICTION]
             mark = " (best)" if m is self.best else ""
             lines.append(
                 [
@@ -340,33 +344,9 @@ def _levels(problem: Problem) -> tuple[FloatArray, FloatArray]:
     return problem.unit_sizes((0, 1, 0)), problem.unit_sizes((0, 0, -1))
 
 
-def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
-    """Return the quantities common to all laws at the parameters' values, see `ComparedModel`."""
-    A, rates = _levels(problem)
-    sizes = np.geomspace(A.min(), A.max(), _TABULATED if A.max() > A.min() else 1)
-    omega = np.asarray(np.exp(np.mean(np.log(rates))))
-    limit, stiffness, energy = 0.0, 0.0, np.zeros(sizes.size)
-    for element in problem.model.elements:
-        if not isinstance(element, Friction):
-            continue
-        at_element = [np.asarray(values[p.name]) for p in element.parameters]
-        with np.errstate(all="ignore"):
-            limit += float(np.mean(element.force_limits(at_element)))
-            contact = float(element.rest_stiffness(at_element))
-            if not contact:  # behind a gap
-                contact = float(element.quasi_static_slope(np.zeros(()), 1.0, at_element))
-            stiffness += contact
-            energy += np.pi * sizes**2 * np.imag(element.stiffness(at_element, sizes, omega))
-    unit = si_unit("displacement", problem.motion)
-    return dict(zip(_OF_FRICTION, (limit, stiffness), strict=True)) | {
-        f"energy a cycle at {size:.2g} {unit}": float(e)
-        for size, e in zip(sizes, energy, strict=True)
-    }
-
-
 def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str]:
     """Return which quantities are not determined, by the first-order error of their logarithms."""
-    names, theta = _OF_FRICTION, optimum.theta
+    names, theta = OF_FRICTION, optimum.theta
     if not optimum.converged:
         return list(names)
     at_optimum = np.array([quantities[name] for name in names])
@@ -375,7 +355,7 @@ def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str
         for step in (-RELATIVE_STEP * size, RELATIVE_STEP * size):
             moved = theta.copy()
             moved[i] += step
-            at_moved = _meaning(optimum.problem, values_at(optimum.problem, moved))
+            at_moved = friction_quantities(optimum.problem, values_at(optimum.problem, moved))
             with np.errstate(all="ignore"):
                 changes[:, i] += np.array([at_moved[n] for n in names]) / at_optimum / (2.0 * step)
     with np.errstate(over="ignore", invalid="ignore"):  # far from determined
@@ -385,7 +365,7 @@ def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str
 
 def _disagreement(first: ComparedModel, second: ComparedModel) -> str:
     """Return the quantity of friction on which two models disagree; "" where they agree."""
-    for key in _OF_FRICTION:
+    for key in OF_FRICTION:
         a, b = first.meaning[key], second.meaning[key]
         if abs(a - b) > _DISAGREE * max(a, b):
             return key

@@ -33,6 +33,7 @@ from scipy.linalg import block_diag
 from dahl_ident.arrays import TINY, BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import DRIVE_FACTOR, EXPONENT
+from dahl_ident.diagnostics.information import NOTICED, Basis
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, limits
 from dahl_ident.fitting.losses import Loss, loss_named
@@ -41,8 +42,6 @@ from dahl_ident.noise import squares_of
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
-_NOTICED = 1e-5  # singular value over the largest, below which a direction is undetermined
-_UNDETERMINED = 1e-3  # undetermined part of a direction that counts as rounding
 GAIN = "force_gain"
 _GAUSS_NEWTON_STEPS = 60  # most Gauss-Newton steps; five are usual
 _NO_BETTER = 0.25  # variance of an exponent over that of its range: there may be two minima
@@ -58,52 +57,6 @@ _LEAST_LEFT = 1e-3  # least part of a test's residuals that is left at high leve
 _MOST_DISAGREEMENT = 1e6  # largest factor of the harmonics' variance
 _SAME_FACTOR = 1e-8  # tolerance of the logarithm of that factor
 _SAME_MISFIT = 1e-9  # relative tolerance of the misfit's square
-
-
-@dataclass(frozen=True)
-class Basis:
-    """Orthonormal directions, (C, r), of the scaled coordinates that the data determine."""
-
-    size: FloatArray
-    directions: FloatArray
-    slopes: FloatArray  # (Q, C): derivatives of theta with respect to the coordinates
-    chart: Chart  # gives theta at the coordinates
-
-    @classmethod
-    def every(cls, count: int) -> Basis:
-        """Return all directions of theta."""
-        unit = np.eye(count)
-        return cls(np.ones(count), unit, unit, Chart(unit, np.zeros(count), unit))
-
-    @classmethod
-    def of(cls, J: FloatArray, theta: FloatArray, chart: Chart) -> Basis:
-        """Return the directions that residuals with the Jacobian J determine."""
-        slopes = chart.derivative(theta)
-        columns = J @ slopes
-        size = 1.0 / np.maximum(np.linalg.norm(columns, axis=0), TINY)
-        _, singular, directions = np.linalg.svd(columns * size, full_matrices=False)
-        return cls(size, directions[singular > _NOTICED * singular[0]].T, slopes, chart)
-
-    @property
-    def matrix(self) -> FloatArray:
-        """Changes of theta, shape (Q, r)."""
-        return np.asarray(self.slopes @ (self.size[:, None] * self.directions))
-
-    def at(self, theta: FloatArray) -> Basis:
-        """Return the same changes of the coordinates at another theta."""
-        return replace(self, slopes=self.chart.derivative(theta))
-
-    def holds(self, slopes: FloatArray) -> BoolArray:
-        """Return whether quantities with the derivatives (..., Q) are determined, shape (...).
-
-        A quantity that depends on theta, but on no coordinate, is infinite in the limit.
-        """
-        largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=TINY)  # against overflow
-        scaled = (slopes / largest) @ self.slopes * self.size
-        outside = scaled - (scaled @ self.directions) @ self.directions.T
-        length = np.linalg.norm(scaled, axis=-1)
-        determined = np.linalg.norm(outside, axis=-1) <= _UNDETERMINED * length
-        return np.asarray(determined & ((length > 0.0) | ~slopes.any(axis=-1)))
 
 
 def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart:
@@ -556,10 +509,10 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: BoolArray) -> float:
     size = np.sqrt(np.maximum(np.diagonal(A + A_h), TINY))
     A, b = A / np.outer(size, size), b / size
     A_h, b_h = A_h / np.outer(size, size), b_h / size
-    directions = int(np.linalg.matrix_rank(A_h, tol=_NOTICED, hermitian=True))
+    directions = int(np.linalg.matrix_rank(A_h, tol=NOTICED, hermitian=True))
 
     def explained(M: FloatArray, v: FloatArray) -> float:
-        return float(v @ np.linalg.pinv(M, rcond=_NOTICED**2, hermitian=True) @ v)
+        return float(v @ np.linalg.pinv(M, rcond=NOTICED**2, hermitian=True) @ v)
 
     def distance(factor: float) -> float:
         separately = explained(A, b) + explained(A_h, b_h) / factor

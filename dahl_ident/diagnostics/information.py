@@ -1,13 +1,19 @@
-"""Fisher information at an optimum: how well each direction of parameter space is determined."""
+"""How well each direction of parameter space is determined, by the Fisher information."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import TINY, BoolArray, FloatArray
 from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.asymptotes import Chart
 from dahl_ident.fitting.optimum import NOTICEABLE_PART, UNDETERMINED
 from dahl_ident.problem import TableProblem
+
+NOTICED = 1e-5  # singular value over the largest, below which a direction is undetermined
+_UNDETERMINED_PART = 1e-3  # undetermined part of a direction that counts as rounding
 
 
 def parameter_values(optimum: Optimum) -> dict[str, float]:
@@ -89,3 +95,49 @@ def shares(optimum: Optimum) -> FloatArray:
         total = squares.sum()
         result.append(squares / total if total > 0.0 else np.full(m // 2, np.nan))
     return np.array(result)
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Orthonormal directions, (C, r), of the scaled coordinates that the data determine."""
+
+    size: FloatArray
+    directions: FloatArray
+    slopes: FloatArray  # (Q, C): derivatives of theta with respect to the coordinates
+    chart: Chart  # gives theta at the coordinates
+
+    @classmethod
+    def every(cls, count: int) -> Basis:
+        """Return all directions of theta."""
+        unit = np.eye(count)
+        return cls(np.ones(count), unit, unit, Chart(unit, np.zeros(count), unit))
+
+    @classmethod
+    def of(cls, J: FloatArray, theta: FloatArray, chart: Chart) -> Basis:
+        """Return the directions that residuals with the Jacobian J determine."""
+        slopes = chart.derivative(theta)
+        columns = J @ slopes
+        size = 1.0 / np.maximum(np.linalg.norm(columns, axis=0), TINY)
+        _, singular, directions = np.linalg.svd(columns * size, full_matrices=False)
+        return cls(size, directions[singular > NOTICED * singular[0]].T, slopes, chart)
+
+    @property
+    def matrix(self) -> FloatArray:
+        """Changes of theta, shape (Q, r)."""
+        return np.asarray(self.slopes @ (self.size[:, None] * self.directions))
+
+    def at(self, theta: FloatArray) -> Basis:
+        """Return the same changes of the coordinates at another theta."""
+        return replace(self, slopes=self.chart.derivative(theta))
+
+    def holds(self, slopes: FloatArray) -> BoolArray:
+        """Return whether quantities with the derivatives (..., Q) are determined, shape (...).
+
+        A quantity that depends on theta, but on no coordinate, is infinite in the limit.
+        """
+        largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=TINY)  # against overflow
+        scaled = (slopes / largest) @ self.slopes * self.size
+        outside = scaled - (scaled @ self.directions) @ self.directions.T
+        length = np.linalg.norm(scaled, axis=-1)
+        determined = np.linalg.norm(outside, axis=-1) <= _UNDETERMINED_PART * length
+        return np.asarray(determined & ((length > 0.0) | ~slopes.any(axis=-1)))

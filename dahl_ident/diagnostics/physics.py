@@ -16,14 +16,15 @@ from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
-from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements import Element, Friction, Model, Parameter
 from dahl_ident.elements.facts import Values
 from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status, values_at_bounds
+from dahl_ident.problem import Problem
 from dahl_ident.problem.steady_rows import levels
-from dahl_ident.units import engineering, percent, shown_unit
+from dahl_ident.units import engineering, percent, shown_unit, si_unit
 
 _WORTH_STATING = 1e-3  # relative difference that is worth stating
 _DISTORTED = 0.05  # distortion of a force that matters: less changes the fundamental below 1 %
@@ -49,6 +50,8 @@ _TYPICAL_ROTATION = {
 _DIMENSIONS = {FORCE: "force limit", STIFFNESS: "contact stiffness"}
 _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
 _NEAR_RATIO = 0.05  # largest relative difference from such a ratio
+_TABULATED = 3  # amplitudes at which the energy of a cycle is tabulated
+OF_FRICTION = "force limit", "stiffness at zero force"  # the same in all laws
 Estimates = tuple[Mapping[str, float], Mapping[str, float]]
 """Values and their standard uncertainties, by name."""
 
@@ -242,6 +245,30 @@ def friction_stiffness(optimum: Optimum, *, with_springs: bool = False) -> Compl
         if element.is_linear and not (with_springs and is_spring(element)):
             linear += view.stiffness_of(element, values)
     return np.asarray(view.stiffness * problem.sensor_factor(optimum.theta) - linear)
+
+
+def friction_quantities(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
+    """Return the quantities of friction that are common to all laws, at the parameters' values."""
+    A, rates = problem.unit_sizes((0, 1, 0)), problem.unit_sizes((0, 0, -1))
+    sizes = np.geomspace(A.min(), A.max(), _TABULATED if A.max() > A.min() else 1)
+    omega = np.asarray(np.exp(np.mean(np.log(rates))))
+    limit, stiffness, energy = 0.0, 0.0, np.zeros(sizes.size)
+    for element in problem.model.elements:
+        if not isinstance(element, Friction):
+            continue
+        at_element = [np.asarray(values[p.name]) for p in element.parameters]
+        with np.errstate(all="ignore"):
+            limit += float(np.mean(element.force_limits(at_element)))
+            contact = float(element.rest_stiffness(at_element))
+            if not contact:  # behind a gap
+                contact = float(element.quasi_static_slope(np.zeros(()), 1.0, at_element))
+            stiffness += contact
+            energy += np.pi * sizes**2 * np.imag(element.stiffness(at_element, sizes, omega))
+    unit = si_unit("displacement", problem.motion)
+    return dict(zip(OF_FRICTION, (limit, stiffness), strict=True)) | {
+        f"energy a cycle at {size:.2g} {unit}": float(e)
+        for size, e in zip(sizes, energy, strict=True)
+    }
 
 
 def _with_values(optimum: Optimum) -> Iterator[tuple[Element, Values]]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dahl_ident.engine.differentiation import differentiated
-from dahl_ident.engine.drive import band_limited
 from dahl_ident.engine.motion import Loops, Marched, Settled, loops, march, settled
 from dahl_ident.engine.periodic import SteadyMotion, steady_motions
+from dahl_ident.engine.sampled import band_limited, differentiated
 from dahl_ident.engine.translate import Equations, System, translate
 
 __all__ = [

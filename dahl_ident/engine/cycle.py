@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, complex128, float64, int64, njit, types
 
+from dahl_ident.engine.collocation import SHORTEST, STAGES
 from dahl_ident.engine.integrate import advance
 from dahl_ident.engine.radau import (
     FUNCTION,
     NUMBERS,
-    STAGES,
     TABLE,
     VECTOR,
     Signal,
@@ -37,7 +37,6 @@ _FOLLOWS = 1e-9  # relative difference of two changes by a cycle that count as p
 _UNDECIDED = 1e-9  # change of all states by a cycle that is an error of its steps
 _FADING = 0.1  # weight of the sizes in earlier cycles, which may have been far too large
 _COARSE = 300.0  # errors of steps while shooting, over those of the last cycle
-_SHORTEST = 12.0  # least number of steps in a cycle of the highest harmonic
 
 
 @compiled
@@ -130,7 +129,7 @@ def cycles(
         signal = Signal(True, amplitudes[row], omegas[row], no_array, no_table)
         period = 2.0 * np.pi / omegas[row]
         times = np.array([0.0, 0.5 * period if odd else period])
-        longest = period / (_SHORTEST * highest)
+        longest = period / (SHORTEST * highest)
         step = 0.1 * longest
         y = first[row]
         if held:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dahl_ident.engine.collocation import POSITIONS, STAGES, VALUE_AT
 from dahl_ident.engine.radau import (
     NEAR,
-    NODES,
-    STAGES,
     compiled,
     evaluate,
     put_interpolated,
@@ -31,12 +30,6 @@ _BISECTIONS = 60
 _VELOCITY_ROUNDING = 1e-14  # of the largest velocity: rounding
 _NO_CHANGE = 1e-6  # relative change of a state, or of a step, that counts as none
 _SHORTENINGS = 12  # of a step that is shortened to an event; two are typical
-POSITIONS = np.concatenate(
-    [a + (b - a) * np.arange(1, 5) / 4 for a, b in zip([0.0, *NODES[:-1]], NODES, strict=True)]
-)
-_POWERS = np.arange(STAGES + 1)
-WEIGHTS = POSITIONS[:, None] ** _POWERS @ np.linalg.inv(np.append(0.0, NODES)[:, None] ** _POWERS)
-"""Weights of values at the beginning and the stages in those at `POSITIONS`."""
 
 
 @compiled
@@ -129,11 +122,11 @@ def first_event(f, signal, t, h, y, w, at):
             continue
         near = NEAR * w[at.scale + row]
         older, old, low, middle = np.inf, w[at.before + e] * side, 0.0, 0.0
-        for i in range(WEIGHTS.shape[0]):
-            high, value = POSITIONS[i], WEIGHTS[i, 0] * w[at.before + e] * side
+        for i in range(VALUE_AT.shape[0]):
+            high, value = POSITIONS[i], VALUE_AT[i, 0] * w[at.before + e] * side
             for j in range(STAGES):
                 stage = w[at.values + j * m + row] if e else y[1] + w[at.stages + j * n + 1]
-                value += WEIGHTS[i, 1 + j] * stage * side
+                value += VALUE_AT[i, 1 + j] * stage * side
             crossed = value < -near
             if not crossed and i and older > old < value and 2.0 * old < older + value:
                 slope1, slope2 = (old - older) / (middle - low), (value - old) / (high - middle)

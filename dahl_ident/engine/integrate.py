@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dahl_ident.engine.collocation import MATRIX, NODES, SLOPE_AFTER, STAGES
 from dahl_ident.engine.events import (
     LOCATED,
     choose_branch,
@@ -20,12 +21,8 @@ from dahl_ident.engine.events import (
 )
 from dahl_ident.engine.radau import (
     GROW,
-    MATRIX,
-    NODES,
     SAFETY,
     SHRINK,
-    SLOPE_AFTER,
-    STAGES,
     at_unit_velocity,
     compiled,
     error_of,

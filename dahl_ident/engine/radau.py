@@ -24,55 +24,28 @@ from collections import namedtuple
 
 import numpy as np
 from numba import float64, int64, njit, types
-from numpy.polynomial import legendre
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.engine.collocation import (
+    CHECKED,
+    FACTORS,
+    MATRIX,
+    NODES,
+    SLOPE_BEFORE,
+    SLOPE_CHECKED,
+    STAGES,
+    VALUE_BEFORE,
+)
 
-STAGES = 5
 SHRINK, GROW, SAFETY = 0.1, 6.0, 0.8  # limits and safety of the factor to the next step
 _STAGE_ITERATIONS = 20  # of the stages; two of Newton's method are typical
 # Relative changes of the stages in an iteration:
 _NEAR, _FAST = 1e-2, 0.2  # largest first one of fixed-point iterations, and largest ratio of two
 _FIXED_POINT = 1e-11  # last one of fixed-point iterations, whose error is a tenth of it
-_SOLVED = 1e-7  # last one of Newton's method, whose error is rounding: its square
+SOLVED = 1e-7  # last one of Newton's method, whose error is rounding: its square
 _HARDLY = 1e-6  # of the displacement: a smaller follower is no scale for errors
 _PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is not a pivot
 NEAR = 1e-10  # of a switching function's largest value: counts as zero
 SIDED = 0.1  # largest relative change of a switching function whose sign is certain
-
-
-def _tables() -> tuple[FloatArray, ...]:
-    """Return nodes and matrix of the method, and weights of the stages at both ends of a step.
-
-    The last three are weights of the changes at the stages in the slope at the beginning and at the
-    end, and weights of values at the stages in the value at the beginning.
-    """
-    series = np.zeros(STAGES + 1)
-    series[STAGES - 1 :] = -1.0, 1.0  # P_s - P_(s-1), whose roots are the nodes
-    nodes = np.sort(np.real(legendre.legroots(series)))
-    for _ in range(3):
-        nodes -= legendre.legval(nodes, series) / legendre.legval(nodes, legendre.legder(series))
-    nodes = 0.5 * (nodes + 1.0)
-    nodes[-1] = 1.0
-    powers = np.arange(STAGES)
-    inverse = np.linalg.inv(nodes[:, None] ** powers)
-    matrix = nodes[:, None] ** (powers + 1) / (powers + 1) @ inverse
-    slopes = np.linalg.inv(matrix)  # of the stages, from the changes
-    return nodes, matrix, inverse[0] @ slopes, slopes[-1], inverse[0]
-
-
-NODES, MATRIX, SLOPE_BEFORE, SLOPE_AFTER, VALUE_BEFORE = _tables()
-_FACTORS = tuple(
-    1.0 / np.prod([NODES[j]] + [NODES[j] - NODES[k] for k in range(STAGES) if k != j])
-    for j in range(STAGES)
-)
-"""Leading coefficients of the polynomials that are 1 at one node, 0 at the others and at 0."""
-
-CHECKED = np.array([0.5 * NODES[0], 0.5 * (NODES[-2] + NODES[-1])])  # positions of error checks
-_POWERS = np.arange(1, STAGES + 1)
-SLOPE_CHECKED = (_POWERS * CHECKED[:, None] ** (_POWERS - 1)) @ np.linalg.inv(
-    NODES[:, None] ** _POWERS
-)
 
 FUNCTION = types.FunctionType(types.void(types.CPointer(float64)))
 NUMBERS, VECTOR, TABLE = int64[::1], float64[::1], float64[:, ::1]
@@ -277,7 +250,7 @@ def put_interpolated(y, position, w, at):
 def set_weights(position, w, at):
     """Set the weights of the changes at the stages in the change at a position, 0 to 1."""
     for j in range(STAGES):
-        value = position * _FACTORS[j]
+        value = position * FACTORS[j]
         for k in range(STAGES):
             if k != j:
                 value *= position - NODES[k]
@@ -491,7 +464,7 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
             for a in range(R):
                 w[z + i * n + solved[a]] += columns[i * R + a, 0]
         complete_stages(followers, h, y, w, at)
-        done = largest < (_SOLVED if newton else _FIXED_POINT)
+        done = largest < (SOLVED if newton else _FIXED_POINT)
         for e in range(at.k if done and newton else 0):  # laws are least linear next to a switch
             size = w[at.scale + n + 1 + e]
             for i in range(STAGES):

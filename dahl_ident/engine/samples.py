@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import float64, int64, njit, types
 
+from dahl_ident.engine.collocation import STAGES
 from dahl_ident.engine.integrate import advance
 from dahl_ident.engine.radau import (
     FUNCTION,
     NUMBERS,
-    STAGES,
     TABLE,
     VECTOR,
     Signal,

@@ -101,7 +101,7 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive, or
     than the motion that exceeds the record's noise.
     """
-    from dahl_ident.engine.differentiation import ABOVE_NOISE  # the engine is slow to import
+    from dahl_ident.engine.sampled import ABOVE_NOISE  # the engine is slow to import
 
     n = len(record)
     drive = record.force_samples
