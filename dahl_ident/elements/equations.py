@@ -10,13 +10,23 @@ acceleration. The states are x, v and those of the elements: one force for most 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.element import Element, Model
-from dahl_ident.elements.law_checks import symbolic_mechanics
+from dahl_ident.elements.facts import Mechanics
+from dahl_ident.elements.law_checks import (
+    SPREAD,
+    TRIALS,
+    explanation,
+    is_of_package,
+    short_repr,
+    trial_values,
+)
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
@@ -27,6 +37,7 @@ if TYPE_CHECKING:
 
 Excitation = Literal["force", "base"]
 Channel = Literal["displacement", "velocity", "acceleration"]
+_TOLERANCE = 1e-8  # relative difference of results with symbols and with numbers
 
 
 @contextmanager
@@ -137,3 +148,86 @@ class FirstState:
         """Return the first state and its derivatives with respect to starts and parameters."""
         first, by_start, by_value = (part.full() for part in self._function(starts, values))
         return first[:, 0], by_start, by_value
+
+
+def symbolic_mechanics(
+    element: Element, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
+) -> Mechanics:
+    """Return an element's part in an equation of motion, in symbols; check a user's."""
+    if is_of_package(type(element)):
+        return element.mechanics(values, x, v, s, states)
+    try:
+        part = element.mechanics(values, x, v, s, states)
+        _check_part(type(element).__name__, part, len(states))
+        if getattr(element, "one_state", False):
+            _check_symbols(element, values, v, s, states[0])
+    except ModelError:
+        raise
+    except Exception as exc:  # whatever a user's code raises
+        raise ModelError(
+            f"{type(element).__name__} cannot be compiled: {explanation(exc)}, and on symbols"
+        ) from exc
+    return part
+
+
+def _check_part(name: str, part: Any, n_states: int) -> None:
+    """Refuse a part in an equation of motion that is not made of single numbers or symbols."""
+    import casadi as ca
+
+    if not isinstance(part, Mechanics) or len(part.rates) != n_states:
+        raise ModelError(
+            f"{name}.mechanics returned {short_repr(part)}; expected an inertia, a force, and as "
+            f"many rates as the element has states, which is {n_states}"
+        )
+    for what, value in (
+        ("force, or output,", part.force),
+        *(("rate", rate) for rate in part.rates),
+    ):
+        try:
+            is_scalar = ca.SX(value).is_scalar()
+        except (NotImplementedError, TypeError):  # casadi's, for types that it does not accept
+            is_scalar = False
+        if not is_scalar:
+            raise ModelError(
+                f"the {what} of {name} is {short_repr(value)} for one force; expected one number, "
+                "N: end the method with return, and use plain arithmetic"
+            )
+
+
+def _check_symbols(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
+    """Refuse results that differ between symbols and numbers, and steps without comparisons."""
+    import casadi as ca
+
+    rng = np.random.default_rng(1)
+    numbers = [trial_values(p, rng, TRIALS) for p in law.parameters]
+    free = [i for i, value in enumerate(values) if not value.is_constant()]
+    slope = law.slope(force, s, v, values)
+    output = law.output(force, slope, v, values)
+    function = ca.Function("law", [force, s, v, *(values[i] for i in free)], [slope, output])
+    codes = {function.instruction_id(i) for i in range(function.n_instructions())}
+    if codes & {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER}:
+        raise ModelError(
+            f"{type(law).__name__} rounds, or takes a remainder (floor, ceil, round, trunc, mod, "
+            "//, %), and where that steps is not located; expected steps as comparisons, such as "
+            "(y < 0.2) + (y < 0.4)"
+        )
+    forces, direction = rng.uniform(-0.5, 0.5, TRIALS), np.resize([1.0, -1.0], TRIALS)
+    speed = direction * 10.0 ** rng.uniform(-SPREAD, SPREAD, TRIALS)
+    with np.errstate(all="ignore"):
+        slopes = law.slope(forces, direction, None if law.rate_independent else speed, numbers)
+        expected = slopes, law.output(forces, slopes, speed, numbers)
+        rows = zip(forces, direction, speed, *(numbers[i] for i in free), strict=True)
+        computed = np.array([[float(number) for number in function(*row)] for row in rows]).T
+    for method, result, by_numbers in zip(("slope", "output"), computed, expected, strict=True):
+        name = f"{type(law).__name__}.{method}"
+        if not np.allclose(result, by_numbers, rtol=_TOLERANCE, atol=0.0, equal_nan=True):
+            raise ModelError(
+                f"{name} cannot be compiled: with symbols in place of numbers it "
+                "gives another result; expected plain arithmetic, comparisons and numpy's "
+                "functions, without math.*, float(), new arrays that are filled, or random numbers"
+            )
+        if not np.isfinite(result).any():
+            raise ModelError(
+                f"{name} is {result[0]} at every force that was tried, such as {forces[0]:.3g} N; "
+                "expected finite numbers, N"
+            )

@@ -1,8 +1,8 @@
 """Checks of a law that a user has written, made when it is first used.
 
-They concern the declared parameters, what ``slope`` returns, the loop that follows from it, and the
-same slope in symbols, for the engine. If a parameter has no value, several sets of values are
-tried, and a slope is refused only if it fails at all of them.
+They concern the declared parameters, what ``slope`` returns, and the loop that follows from it;
+those of :mod:`dahl_ident.elements.equations` the slope in symbols. If a parameter has no value,
+several sets of values are tried, and a slope is refused only if it fails at all of them.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.facts import Mechanics
 from dahl_ident.elements.force_law import ForceLaw
 from dahl_ident.elements.parameter import UNITS, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
-_TRIALS = 12  # sets of values
-_SPREAD = 0.5  # decades to either side of a typical value
+TRIALS = 12  # sets of values
+SPREAD = 0.5  # decades to either side of a typical value
 _MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
 _REST = len(_MAGNITUDES)  # index of force 0, after all negative ones
 _FRACTIONS = np.linspace(0.0, 1.0, 201)  # of the largest force in each direction
@@ -39,7 +38,6 @@ _SLOPE_ROUNDING = 1e-9  # of the largest slope
 _LOOP = 0.98  # of the force of full slip: the largest force of a loop
 _LOOP_WITHOUT_SLIP = 2.94  # times the scale: the same for a law without full slip
 _CREATED = 0.01  # of the work in both directions: energy that integration may create
-_TOLERANCE = 1e-8  # relative difference of results with symbols and with numbers
 _FORCE_UNIT = 32.0  # N, a unit in which a law has the same form; a power of 2 changes no digit
 _OVERRIDDEN = {"rest_stiffness": 1, "force_limits": 2, "force_bounds": 2, "knee": 2}
 """Methods that a law may override, and how many arrays each returns."""
@@ -62,8 +60,6 @@ class _SlopeLaw(Protocol):
     def label(self, parameter: Parameter) -> str: ...
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any: ...
-
-    def output(self, force: Any, slope: Any, velocity: Any, values: Sequence[Any]) -> Any: ...
 
 
 def is_of_package(law: type) -> bool:
@@ -153,8 +149,8 @@ def check_slope(law: _SlopeLaw) -> None:
     if parameters in checked:
         return
     rng = np.random.default_rng(0)
-    count = 1 if all(p.value is not None for p in parameters) else _TRIALS
-    columns = [_trial_values(p, rng, count) for p in parameters]
+    count = 1 if all(p.value is not None for p in parameters) else TRIALS
+    columns = [trial_values(p, rng, count) for p in parameters]
     trials = [_Trial(law, values) for values in np.reshape(columns, (len(columns), count)).T]
     for check in (_Trial.up_to_slip, _Trial.constant, _Trial.energy, _Trial.without_slip):
         objections = [check(trial) for trial in trials]
@@ -174,12 +170,12 @@ def _check_overridden(law: _SlopeLaw, values: list[FloatArray]) -> None:
             with np.errstate(all="ignore"):
                 returned: Any = getattr(law, method)(values)
         except Exception as exc:  # whatever a user's code raises
-            raise ModelError(f"{name} failed: {_explanation(exc)}") from exc
+            raise ModelError(f"{name} failed: {explanation(exc)}") from exc
         parts = (returned,) if count == 1 else returned
         complete = isinstance(parts, tuple) and len(parts) == count
         if not complete or any(np.asarray(part).dtype.kind not in "fiu" for part in parts):
             raise ModelError(
-                f"{name} returned {_short_repr(returned)}; expected {arrays} of real numbers, one "
+                f"{name} returned {short_repr(returned)}; expected {arrays} of real numbers, one "
                 "for each set of values: end it with return"
             )
 
@@ -201,10 +197,10 @@ def _agrees_with_units(law: _SlopeLaw) -> bool:
     if not set(powers) <= {0, 1}:
         return False
     rng = np.random.default_rng(2)
-    values = [_trial_values(p, rng, _TRIALS) for p in law.parameters]
-    force = rng.uniform(-1.0, 1.0, _TRIALS) * 10.0 ** rng.uniform(-3.0, 3.0, _TRIALS)
-    direction = np.resize([1.0, -1.0], _TRIALS)
-    speed = None if law.rate_independent else direction * rng.uniform(0.1, 1.0, _TRIALS)
+    values = [trial_values(p, rng, TRIALS) for p in law.parameters]
+    force = rng.uniform(-1.0, 1.0, TRIALS) * 10.0 ** rng.uniform(-3.0, 3.0, TRIALS)
+    direction = np.resize([1.0, -1.0], TRIALS)
+    speed = None if law.rate_independent else direction * rng.uniform(0.1, 1.0, TRIALS)
     scaled = [v * _FORCE_UNIT**power for v, power in zip(values, powers, strict=True)]
     try:
         with np.errstate(all="ignore"):
@@ -212,8 +208,8 @@ def _agrees_with_units(law: _SlopeLaw) -> bool:
             rescaled = np.asarray(law.slope(_FORCE_UNIT * force, direction, speed, scaled))
     except Exception as exc:  # not seen with one set of values, such as an if on a value
         raise ModelError(
-            f"{type(law).__name__}.slope failed for arrays of {_TRIALS} forces and of {_TRIALS} "
-            f"of each value: {_explanation(exc)}"
+            f"{type(law).__name__}.slope failed for arrays of {TRIALS} forces and of {TRIALS} "
+            f"of each value: {explanation(exc)}"
         ) from exc
     return bool(np.allclose(rescaled, _FORCE_UNIT * slope, rtol=1e-12, atol=0.0, equal_nan=True))
 
@@ -260,13 +256,13 @@ class _Trial:
                     f"{name} failed without a velocity ({exc}); a law that uses the velocity must "
                     "declare rate_independent = False"
                 ) from exc
-            raise ModelError(f"{name} failed for {arguments}: {_explanation(exc)}") from exc
+            raise ModelError(f"{name} failed for {arguments}: {explanation(exc)}") from exc
         if returned is None:
             raise ModelError(f"{name} returned None; expected dF/dx, N/m: end it with return")
         array: NDArray[Any] = np.asarray(returned)
         if array.dtype.kind not in "fiub":
             raise ModelError(
-                f"{name} returned {_short_repr(returned)}, numbers of type {array.dtype}; expected "
+                f"{name} returned {short_repr(returned)}, numbers of type {array.dtype}; expected "
                 "dF/dx, N/m, as real numbers"
             )
         try:
@@ -473,14 +469,14 @@ class _Trial:
         return np.asarray(cumulative_trapezoid(parts, force, initial=0))
 
 
-def _trial_values(parameter: Parameter, rng: np.random.Generator, count: int) -> FloatArray:
+def trial_values(parameter: Parameter, rng: np.random.Generator, count: int) -> FloatArray:
     """Return trial values of a parameter: its own if it is fixed, else some within its range."""
     if parameter.value is not None and (not parameter.free or count == 1):
         return np.full(count, float(parameter.value))
     if parameter.scan:
         return np.resize(np.asarray(parameter.scan, dtype=np.float64), count)
     low, high = parameter.prior or (parameter.lower, parameter.upper)
-    spread = 10.0 ** rng.uniform(-_SPREAD, _SPREAD, count)
+    spread = 10.0 ** rng.uniform(-SPREAD, SPREAD, count)
     if math.isfinite(low) and math.isfinite(high):
         share = rng.uniform(0.05, 0.95, count)
         if parameter.positive and low > 0.0:
@@ -495,7 +491,7 @@ def _trial_values(parameter: Parameter, rng: np.random.Generator, count: int) ->
     return np.asarray(spread)
 
 
-def _explanation(exc: Exception) -> str:
+def explanation(exc: Exception) -> str:
     """Return why a user's code failed, and what to write instead."""
     text = " ".join(str(exc).split())
     if "truth value" in text:
@@ -514,89 +510,7 @@ def _explanation(exc: Exception) -> str:
     )
 
 
-def _short_repr(value: Any) -> str:
+def short_repr(value: Any) -> str:
+    """Return what Python shows of a value, at most 40 characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 40 else f"{text[:40]}..."
-
-
-def symbolic_mechanics(
-    element: ForceLaw, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
-) -> Mechanics:
-    """Return an element's part in an equation of motion, in symbols; check a user's."""
-    if is_of_package(type(element)):
-        return element.mechanics(values, x, v, s, states)
-    try:
-        part = element.mechanics(values, x, v, s, states)
-        _check_part(type(element).__name__, part, len(states))
-        if getattr(element, "one_state", False):
-            _check_symbols(element, values, v, s, states[0])
-    except ModelError:
-        raise
-    except Exception as exc:  # whatever a user's code raises
-        raise ModelError(
-            f"{type(element).__name__} cannot be compiled: {_explanation(exc)}, and on symbols"
-        ) from exc
-    return part
-
-
-def _check_part(name: str, part: Any, n_states: int) -> None:
-    """Refuse a part in an equation of motion that is not made of single numbers or symbols."""
-    import casadi as ca
-
-    if not isinstance(part, Mechanics) or len(part.rates) != n_states:
-        raise ModelError(
-            f"{name}.mechanics returned {_short_repr(part)}; expected an inertia, a force, and as "
-            f"many rates as the element has states, which is {n_states}"
-        )
-    for what, value in (
-        ("force, or output,", part.force),
-        *(("rate", rate) for rate in part.rates),
-    ):
-        try:
-            is_scalar = ca.SX(value).is_scalar()
-        except (NotImplementedError, TypeError):  # casadi's, for types that it does not accept
-            is_scalar = False
-        if not is_scalar:
-            raise ModelError(
-                f"the {what} of {name} is {_short_repr(value)} for one force; expected one number, "
-                "N: end the method with return, and use plain arithmetic"
-            )
-
-
-def _check_symbols(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
-    """Refuse results that differ between symbols and numbers, and steps without comparisons."""
-    import casadi as ca
-
-    rng = np.random.default_rng(1)
-    numbers = [_trial_values(p, rng, _TRIALS) for p in law.parameters]
-    free = [i for i, value in enumerate(values) if not value.is_constant()]
-    slope = law.slope(force, s, v, values)
-    output = law.output(force, slope, v, values)
-    function = ca.Function("law", [force, s, v, *(values[i] for i in free)], [slope, output])
-    codes = {function.instruction_id(i) for i in range(function.n_instructions())}
-    if codes & {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER}:
-        raise ModelError(
-            f"{type(law).__name__} rounds, or takes a remainder (floor, ceil, round, trunc, mod, "
-            "//, %), and where that steps is not located; expected steps as comparisons, such as "
-            "(y < 0.2) + (y < 0.4)"
-        )
-    forces, direction = rng.uniform(-0.5, 0.5, _TRIALS), np.resize([1.0, -1.0], _TRIALS)
-    speed = direction * 10.0 ** rng.uniform(-_SPREAD, _SPREAD, _TRIALS)
-    with np.errstate(all="ignore"):
-        slopes = law.slope(forces, direction, None if law.rate_independent else speed, numbers)
-        expected = slopes, law.output(forces, slopes, speed, numbers)
-        rows = zip(forces, direction, speed, *(numbers[i] for i in free), strict=True)
-        computed = np.array([[float(number) for number in function(*row)] for row in rows]).T
-    for method, result, by_numbers in zip(("slope", "output"), computed, expected, strict=True):
-        name = f"{type(law).__name__}.{method}"
-        if not np.allclose(result, by_numbers, rtol=_TOLERANCE, atol=0.0, equal_nan=True):
-            raise ModelError(
-                f"{name} cannot be compiled: with symbols in place of numbers it "
-                "gives another result; expected plain arithmetic, comparisons and numpy's "
-                "functions, without math.*, float(), new arrays that are filled, or random numbers"
-            )
-        if not np.isfinite(result).any():
-            raise ModelError(
-                f"{name} is {result[0]} at every force that was tried, such as {forces[0]:.3g} N; "
-                "expected finite numbers, N"
-            )

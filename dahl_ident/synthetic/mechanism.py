@@ -10,8 +10,12 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, LinearSystem, Model
 from dahl_ident.elements.element import as_model
-from dahl_ident.elements.equations import law_equations, numpy_names, plant_equations
-from dahl_ident.elements.law_checks import symbolic_mechanics
+from dahl_ident.elements.equations import (
+    law_equations,
+    numpy_names,
+    plant_equations,
+    symbolic_mechanics,
+)
 from dahl_ident.elements.rational import Rational
 from dahl_ident.engine import Equations, march, translate
 from dahl_ident.errors import FitError, ModelError
