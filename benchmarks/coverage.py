@@ -27,9 +27,9 @@ from scipy import special
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Model, Spring, response
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
 from dahl_ident.diagnostics.confidence_levels import LEVELS
 from dahl_ident.diagnostics.intervals import (
+    bootstrap_intervals,
     natural_sizes,
     profile_intervals,
     wald_intervals,

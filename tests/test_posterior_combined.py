@@ -9,7 +9,7 @@ from benchmarks.uncertainty import several_days
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.diagnostics.contributions import NOISE
-from dahl_ident.diagnostics.shared_errors import row_errors
+from dahl_ident.diagnostics.error_model import row_errors
 from dahl_ident.errors import SamplingError, ValidationError
 from tests.bayes_cases import friction_table
 

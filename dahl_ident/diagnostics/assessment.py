@@ -13,7 +13,6 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bands import DerivedQuantity, derived
-from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
 from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget, taken_as_exact
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.contributions import NOISE
@@ -26,6 +25,7 @@ from dahl_ident.diagnostics.intervals import (
     METHODS,
     ConfidenceIntervals,
     Method,
+    bootstrap_intervals,
     combined_intervals,
     profile_intervals,
     wald_intervals,

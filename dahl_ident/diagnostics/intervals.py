@@ -15,8 +15,8 @@ quick to thorough:
     (:mod:`dahl_ident.diagnostics.profile`). Follows curvature; a side on which the data set no
     limit is open.
 ``bootstrap``
-    Fits to simulated repetitions of the measurement, studentised
-    (:mod:`dahl_ident.diagnostics.bootstrap`). Follows the estimate's actual distribution.
+    Fits to simulated repetitions of the measurement, studentised (:func:`bootstrap_intervals`).
+    Follows the estimate's actual distribution.
 
 Use: ``wald`` is computed with every fit and suffices while ``compare_intervals`` shows no
 disagreement; ``profile`` whenever a parameter is badly determined; ``bootstrap`` to check both.
@@ -31,7 +31,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.diagnostics.confidence_levels import (
     LEVELS,
     MANY,
@@ -43,8 +43,10 @@ from dahl_ident.diagnostics.confidence_levels import (
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import degrees_text, table
 from dahl_ident.diagnostics.profile import Profiler
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.optimum import Status
+from dahl_ident.fitting.search import repetitions
 from dahl_ident.problem.space import Space
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
@@ -53,6 +55,8 @@ _LARGE = 0.1  # u of a logarithm from noise alone, above which a side may be ope
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _DISAGREES = 0.2  # half widths between the limits of two methods
 _LIMIT_ROUNDING = 1e-9  # relative difference of limits that is rounding
+_FEWEST = 99  # replicates: with fewer, a tail of 1 % has none
+_AT_LIMIT = 0.01  # share of diverging replicates above which the interval is symmetric
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
@@ -351,3 +355,70 @@ def search_coordinates(optimum: Optimum, values: FloatArray) -> FloatArray:
     positive = optimum.problem.space.positive[: values.shape[-1]]
     with np.errstate(divide="ignore"):
         return np.where(positive, np.log(np.where(positive, values, 1.0)), values)
+
+
+def _replicate(optimum: Optimum, replicates: int | None, seed: int) -> FloatArray:
+    """Return t* of simulated repetitions, (S, P); NaN if one diverges or is not determined."""
+    if replicates is None:
+        replicates = optimum.problem.n_simulations
+    count = whole_number(replicates, "replicates", _FEWEST)
+    if optimum.loss != "linear":
+        raise ValidationError(
+            f"the fit has the robust loss {optimum.loss}, and repetitions with its outliers cannot "
+            "be simulated; take profile intervals"
+        )
+    if optimum.status is Status.NOT_CONVERGED or not np.isfinite(optimum.scale):
+        raise FitError("there is no optimum to simulate repetitions from")
+    theta, error = repetitions(optimum, count, np.random.default_rng(whole_number(seed, "seed", 0)))
+    known = np.isfinite(theta) & np.isfinite(error) & (error > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(known, (theta - optimum.theta) / error, np.nan)
+
+
+def bootstrap_intervals(
+    optimum: Optimum, levels: Sequence[float] = LEVELS, replicates: int | None = None, seed: int = 0
+) -> ConfidenceIntervals:
+    r"""Return studentised bootstrap intervals, from fits to simulated repetitions.
+
+    Responses are drawn from the likelihood at the estimate, with the noise scale that was
+    estimated, and every set is fitted like the original. The distribution of
+
+        t* = (theta* - theta_hat) / stderr*
+
+    replaces Student's t: the interval from c to C of it is theta_hat - C stderr to theta_hat - c
+    stderr (the studentised bootstrap, or bootstrap-t; Efron and Tibshirani, An Introduction to the
+    Bootstrap, 1993, chapter 12). Because each replicate brings its own standard error, the
+    estimated noise scale is accounted for.
+
+    Replicates whose optimum lies at infinity have no t*. If their fraction exceeds the probability
+    outside the interval, the distribution of t* is not informative, and the interval is open on
+    both sides; use the profile there.
+
+    If any parameter diverges in more than a hundredth of the replicates, the estimate lies at or
+    near a limit of the model. Which tail of t* is long depends on the side of the limit on which
+    the true value lies; a bootstrap from the estimate cannot determine this (Andrews, Econometrica
+    68 (2000) 399-405). The size of t* depends on it much less, and the interval is theta_hat -+ C
+    stderr, C from the distribution of |t*| (Hall, Journal of the Royal Statistical Society B 50
+    (1988) 35-45).
+    """
+    array = checked_levels(levels)
+    tail = 0.5 * (1.0 - array)
+    count = optimum.problem.n_reported
+    drawn = _replicate(optimum, replicates, seed)[:, :count]
+    diverged = np.isnan(drawn)
+    symmetric = bool(diverged.any(axis=1).mean() > _AT_LIMIT)
+    error = np.sqrt(np.diagonal(optimum.covariance))
+    lower, upper = np.full((len(array), count), -np.inf), np.full((len(array), count), np.inf)
+    for i in np.flatnonzero(np.isfinite(error[:count])):
+        t = drawn[~diverged[:, i], i]
+        known = diverged[:, i].mean() <= tail
+        if known.any():
+            size = np.quantile(np.abs(t), array[known])
+            tails = np.quantile(t, [tail[known], 1.0 - tail[known]])
+            ends = np.array([-size, size]) if symmetric else tails
+            upper[known, i], lower[known, i] = optimum.theta[i] - ends * error[i]
+    result = intervals_from_search(optimum, "bootstrap", array, lower, upper)
+    note = f"studentised, {len(drawn)} replicates, seed {seed}"
+    if symmetric:
+        note += "; symmetric, since replicates end at a limit of the model"
+    return replace(result, note=note)

@@ -24,8 +24,8 @@ from dahl_ident.bayes.sample import (
 )
 from dahl_ident.data.columns import one_of
 from dahl_ident.diagnostics.contributions import EXPONENT, NOISE
+from dahl_ident.diagnostics.error_model import row_errors
 from dahl_ident.diagnostics.estimate import with_assumed
-from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.elements.element import as_model
