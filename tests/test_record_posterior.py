@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from scipy.stats import norm, t
 
 import dahl_ident as di
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from tests.test_record_fit import DAHL, driven, recorded
 
 
@@ -62,6 +62,14 @@ def test_outliers_are_left_to_the_intervals_of_a_robust_fit():
     with pytest.raises(ValidationError, match="use the fit's confidence intervals, or pass"):
         di.posterior(robust)
     assert robust.conf_interval()
+
+
+@pytest.mark.parametrize("method", ["grid", "mcmc"])
+def test_a_prior_that_excludes_the_data_is_refused_at_once(method):
+    record, model = recorded(DAHL, "random", 300, 1e-3), di.Dahl(alpha=1.0)
+    words = r"f_max is 0\.\d+, .* uncertainties outside its prior \(log-uniform from 1 to 2 N\)"
+    with pytest.raises(SamplingError, match=words):
+        di.posterior(record, model, method=method, priors={"f_max": (1.0, 2.0)})
 
 
 def test_a_posterior_counts_noise_alone_or_the_stated_calibration():

@@ -268,6 +268,9 @@ _TRIES = 60  # most draws of a start, each 0.8 as wide as the last
 _INSIDE = 1e-3  # distance of a centre from the prior's ends, over its width
 _PRIOR_DRAWS = 4096  # draws of the prior: 98 % probability to hit a region of 1e-3 of it
 _POSITIONS = 5  # values tried for a parameter outside its prior, each with a fit of the others
+# standard uncertainties from an estimate to its prior beyond which the prior excludes it: chance
+# takes a normal estimate that far off once in two million times
+_EXCLUDED = 5.0
 _EXACT_DATA = 1e-13  # relative noise below which residuals are rounding
 
 
@@ -319,6 +322,7 @@ def centre_and_covariance(
 ) -> tuple[FloatArray, FloatArray]:
     """Return approximate centre and covariance of the posterior."""
     if density.around is not None:
+        _refuse_exclusion(density, *density.around)
         return density.around
     assert isinstance(density, Density)
     theta = _inside(density, optimum, random)
@@ -332,6 +336,23 @@ def centre_and_covariance(
         precision = precision + information
     size = 1.0 / np.sqrt(np.diagonal(precision))
     return theta, np.linalg.inv(precision * np.outer(size, size)) * np.outer(size, size)
+
+
+def _refuse_exclusion(density: LogDensity, centre: FloatArray, covariance: FloatArray) -> None:
+    """Refuse priors that exclude the data's estimate, around which alone the density is known."""
+    low, high = density.prior.limits
+    away = np.maximum(low - centre, centre - high) / np.sqrt(np.diagonal(covariance))
+    values = density.to_values(centre)
+    outside = [
+        f"{name} is {value:.4g}, {u:.3g} standard uncertainties outside its prior ({text})"
+        for (name, text), value, u in zip(density.priors.items(), values, away, strict=True)
+        if u > _EXCLUDED
+    ]
+    if outside:
+        raise SamplingError(
+            f"the priors exclude what the data show: {'; '.join(outside)}. Check the prior, its "
+            "unit, and the data; to keep the parameter there all the same, fix it"
+        )
 
 
 def _centre_and_root(
