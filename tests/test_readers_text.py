@@ -52,6 +52,7 @@ class TestDialects:
             PLAIN.replace("[", "(").replace("]", ")"),
             "time,x,F\ns,mm,kN\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n",
             "time,x,F\n[s],[mm],[kN]\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n",
+            '"time, s","x, mm","F, kN"\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n',
             "Test rig 5\nSample rate,2\nOperator;A. Hill\n\n" + PLAIN,
             "Channel 1,Channel 2,Channel 3\n" + PLAIN,
             PLAIN.replace("\n0,", "\nRate=2 Hz,24 Bit,\n0,"),

@@ -57,7 +57,8 @@ _FEWEST_VALUES = 4  # with fewer, a value far from the others may be measured
 _LONGEST_WORD = 200  # letters of a label, time stamp or number
 _LONGEST_HEADER = 400  # letters of a cell with name and unit
 _INDEX = re.compile(r"[\d:, ]+")
-_UNBRACKETED = re.compile(r"\s*(.*\S)\s+(?:/|in)\s+(\S.*)")  # F / N, according to ISO 80000
+# F / N, according to ISO 80000, or F, N
+_UNBRACKETED = re.compile(r"\s*(.*\S)(?:\s+(?:/|in)|,)\s+(\S.*)")
 _CURVED = re.compile(r"\s*(.*?\S)\s*\((.*)\)\s*")
 _PADDING = (1 << 26, 16)  # most memory of a column of text: bytes, or bytes per letter
 
@@ -338,7 +339,7 @@ def plain(name: str) -> str:
 
 
 def split_header(text: str) -> tuple[str, str | None]:
-    """Split ``"force [kN]"``, ``"force (kN)"``, ``"F / kN"`` or ``"force in kN"``.
+    """Split ``"force [kN]"``, ``"force (kN)"``, ``"F / kN"``, ``"force in kN"`` or ``"force, kN"``.
 
     Text in square brackets is the unit, unless it is an index.
     """
