@@ -132,7 +132,7 @@ def test_command_line_and_report(run):
     pytest.importorskip("jsonschema").validate(facts, json.loads(schema.read_text("utf-8")))
     assert facts["record_fits"][0]["parameters"]["sigma"]["value"] == pytest.approx(30.0, rel=0.05)
     assert len(facts["posteriors"]) == 1
-    assert any(line.startswith("Posterior: ") for line in facts["verdict"])
+    assert any(line.startswith("Posterior: Counted: ") for line in facts["verdict"])
     refused = run(*words, "--likelihood", "student_t")
     assert refused.status == 1
     assert "--likelihood is given with records" in refused.err

@@ -410,3 +410,11 @@ def test_a_fit_with_constraints_is_reported(tmp_path):
     text = di.report(fit, tmp_path / "report.md").read_text("utf-8")
     assert "Wald 95.45 %" in text
     assert "profile" not in text.split("## Parameters")[1].split("## ")[0]
+
+
+def test_profiles_have_their_minima_at_the_estimates(tmp_path):
+    """The exponent that was not given is held at its estimate, as in the table of intervals."""
+    fit = di.fit(di.load_dataset("noisy"), di.Dahl())
+    html = di.report(fit, tmp_path / "report.html").read_text("utf-8")
+    minima = ", ".join(f"{name} is {fit.params[name].value:.4g}" for name in fit.var_names)
+    assert f"at the minima {minima}." in html

@@ -19,6 +19,7 @@ from dahl_ident.diagnostics.information import shares
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Friction, UniversalCurve
 from dahl_ident.errors import ValidationError
+from dahl_ident.fitting import Optimum
 from dahl_ident.plots.style import new_axes
 from dahl_ident.reporting.document import Picture
 from dahl_ident.reporting.provenance import parts, sources
@@ -208,14 +209,15 @@ def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
 
 def _profiles(fit: FitResult) -> Picture:
     """Return the picture of all parameters' profiles, two panels in each row."""
-    best = [f"{name} is {v:.4g}" for name, v in zip(fit.var_names, fit.optimum.values, strict=True)]
+    optimum = fit.assessment.by_noise
+    best = [f"{name} is {v:.4g}" for name, v in zip(fit.var_names, optimum.values, strict=True)]
 
     def draw() -> Any:
         rows = -(-fit.nvarys // 2)
         grid = new_axes(rows, 2, size=(4.8, 1.9 * rows), sharex=False)
         for index, axis in enumerate(grid.flat):
             if index < fit.nvarys:
-                _draw_profile(fit, index, axis)
+                _draw_profile(optimum, index, axis)
             else:
                 axis.set_axis_off()
         return grid
@@ -223,19 +225,18 @@ def _profiles(fit: FitResult) -> Picture:
     return Picture(
         "profiles",
         "Profile likelihood of each parameter, from noise alone: where the curve meets a dashed "
-        "line is the limit at that confidence. Stated estimates weigh every source of error, and "
-        "may differ from its minimum.",
+        "line is the limit at that confidence.",
         f"One curve for each parameter; at the minima {', '.join(best)}.",
         draw,
     )
 
 
-def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
+def _draw_profile(optimum: Optimum, index: int, axis: plots.Axes) -> None:
     """Draw a profile out to its widest limit, or over three decades if that is open."""
-    name, parameter = fit.var_names[index], fit.problem.parameters[index]
-    profiler = Profiler(fit.optimum)
-    q = thresholds(fit.optimum, np.array(LEVELS))
-    best = float(fit.optimum.theta[index])
+    name, parameter = optimum.names[index], optimum.problem.parameters[index]
+    profiler = Profiler(optimum)
+    q = thresholds(optimum, np.array(LEVELS))
+    best = float(optimum.theta[index])
     reach = np.log(1e3) if parameter.positive else abs(best) + 1.0
     lower, upper = (side[-1, index] for side in profiler.limits(q))
     low = lower if np.isfinite(lower) else best - reach
@@ -244,7 +245,7 @@ def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
     plots.plot_profile(
         np.exp(coordinate) if parameter.positive else coordinate,
         profiler.curve(index, coordinate),
-        best=float(fit.optimum.values[index]),
+        best=float(optimum.values[index]),
         limits={level_text(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
         label=f"{name} [{parameter.unit}]" if parameter.unit else name,
         log=bool(parameter.positive and np.ptp(coordinate) > _STRAIGHT),

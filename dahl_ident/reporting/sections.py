@@ -131,7 +131,7 @@ def _of_one_table(results: Sequence[Result], known: Metadata, record: Record | N
         details.append(Section("Data", (tables.measured(data),), details=True))
     verdict = [*compared.verdict, *(line for fit in fits for line in _verdict(fit, fits))]
     for posterior in posteriors:
-        verdict += [f"Posterior: {posterior.findings[0]}", *map(str, posterior.findings[1:])]
+        verdict += [f"Posterior: {finding}" for finding in posterior.findings]
     parts = provenance.parts(results[0].provenances)
     files = [Path(str(part["file"])).name for part in parts if "file" in part]
     return Document(
@@ -328,7 +328,6 @@ def _posterior_details(posterior: Posterior) -> Iterator[Section]:
     """Yield numbers, convergence and pictures."""
     priors = tuple(f"{name}: {text}" for name, text in posterior.priors.items())
     numbers: list[Block] = [
-        Paragraph(posterior.message),
         tables.posterior_summary(posterior),
         Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):"),
         Bullets(priors),
@@ -336,7 +335,7 @@ def _posterior_details(posterior: Posterior) -> Iterator[Section]:
     ]
     pictures = [corner(posterior)]
     if posterior.is_chain:
-        numbers.insert(2, Paragraph(_OF_CHAIN))
+        numbers.insert(1, Paragraph(_OF_CHAIN))
         numbers.append(Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain."))
         pictures.append(trace(posterior))
     yield Section("Posterior", tuple(numbers), details=True)
