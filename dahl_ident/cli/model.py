@@ -48,7 +48,10 @@ class ModelOptions:
     displacement_gain: str | None = setting(
         f"Measured over true displacement: {_SENSOR_HELP}", panel="Sensors"
     )
-    delay: str | None = setting(f"Lag of the displacement channel: {_SENSOR_HELP}", panel="Sensors")
+    delay: str | None = setting(
+        "Lag of the displacement channel: 0.1ms, 'free', or a prior in s, 'norm(0, 1e-4)'.",
+        panel="Sensors",
+    )
     metadata: Path | None = setting(
         "TOML file of the report: instruments with a channel, an uncertainty and k give the "
         "sensors' priors.",

@@ -127,8 +127,7 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     ends = dict.fromkeys((f"{start:.4g}", f"{stop:.4g}"))
     when = f"between {' and '.join(ends)}" if len(ends) > 1 else f"at {start:.4g}"
     worst = (
-        f"most {when} s{which}, where the residuals are "
-        f"{square**0.5 / rms if rms else 0.0:.2g} times larger"
+        f"they are largest {when} s{which}, {square**0.5 / rms if rms else 0.0:.2g} times their rms"
     )
     products = sum(float(e[1:] @ e[:-1]) for e in residuals)
     return RecordGoodness(
@@ -250,7 +249,7 @@ class RecordAssessment(Assessment):
         ln_u = np.array([p.std for p in assumed])
         ln_U = coverage_factors(self.errors.least_dof, array[:, None]) * ln_u
         assumed_values = np.array([p.value for p in assumed])
-        note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
+        note = f"every source of the budget, {self.errors.effective:.0f} effective samples"
         return ConfidenceIntervals(
             "combined",
             array,
