@@ -20,6 +20,8 @@ from scipy.stats import binom
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.element import as_model
+from dahl_ident.fitting import solve_many
+from dahl_ident.problem import ProblemBatch
 
 TABLES, PROBLEMS, SEED = 200, 1000, 1
 _BATCH = 100
@@ -136,10 +138,9 @@ def deviations(
     data, truth = tables(law, count, noise, seed, decades)
     begin, parts = time.process_time(), []
     for first in range(0, count, _BATCH):
-        batch = di.fit_many(data[first : first + _BATCH], law.asked)
-        optima = batch.optima
+        optima = solve_many(ProblemBatch(data[first : first + _BATCH], law.asked))
         error = (optima.values - truth[first : first + _BATCH]) / optima.stderr
-        parts.append(np.where(np.asarray(batch.success)[:, None], error, np.nan))
+        parts.append(np.where(optima.success[:, None], error, np.nan))
     return np.concatenate(parts), time.process_time() - begin
 
 

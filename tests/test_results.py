@@ -197,12 +197,30 @@ class TestMany:
         frame = many.to_frame()
         names = "f_max f_max_stderr f_max_stderr_noise sigma sigma_stderr sigma_stderr_noise"
         assert list(frame) == [*names.split(), "scale", "status"]
-        for i, one in enumerate(many.tables):
-            sigma, row = fit(one, di.Dahl()).params["sigma"], frame.iloc[i]
+        for i, one in enumerate(many):
+            sigma, row = fit(one.data, di.Dahl()).params["sigma"], frame.iloc[i]
             assert row["sigma"] == pytest.approx(sigma.value, rel=1e-4)
             assert row["sigma_stderr"] == pytest.approx(sigma.stderr, rel=1e-3)
             assert 0.0 < row["sigma_stderr_noise"] <= row["sigma_stderr"]
-        assert repr(many) == "<FitBatch: 3 tables, free f_max, sigma; 3 converged>"
+        assert repr(many) == "<FitBatch: 3 fits, free f_max, sigma; 3 converged>"
+
+    def test_records_are_fitted_one_by_one(self):
+        t = np.arange(400) / 100.0
+        x = 0.01 * np.sin(np.pi * t)
+        limits = (0.1, 0.2)
+        noise = 1e-3 * np.random.default_rng(0).standard_normal((2, t.size))
+        records = [
+            di.Record(t, displacement=x, force=di.Dahl(f_max, 30.0, alpha=1.0).force(x) + e)
+            for f_max, e in zip(limits, noise, strict=True)
+        ]
+        many = fit_many(records, di.Dahl(alpha=1.0))
+        frame = many.to_frame()
+        assert many.success.all()
+        for truth, (value, u) in zip(limits, frame[["f_max", "f_max_stderr"]].values, strict=True):
+            assert value == pytest.approx(truth, abs=3.0 * u)
+            assert u < 0.01 * truth
+        alone = fit(records[1], di.Dahl(alpha=1.0))
+        assert many[1].params["sigma"].value == alone.params["sigma"].value
 
     def test_tables_must_agree(self):
         with pytest.raises(DataError, match="table 1 has 8 rows"):

@@ -22,6 +22,7 @@ from dahl_ident.bayes.sample import (
     sample_points,
     starting_points,
 )
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.columns import one_of
 from dahl_ident.diagnostics.contributions import EXPONENT, NOISE
 from dahl_ident.diagnostics.error_model import row_errors
@@ -47,7 +48,6 @@ from dahl_ident.sensors import Sensors
 if TYPE_CHECKING:
     import pandas as pd
 
-    from dahl_ident.data import FrequencyResponse, Record
     from dahl_ident.elements.equations import Excitation
     from dahl_ident.fitting.ipopt import Constraints
     from dahl_ident.problem.record_waves import Output
@@ -207,7 +207,7 @@ def fit(
 
 
 def fit_many(
-    tables: Sequence[FrequencyResponse],
+    data: Sequence[FrequencyResponse] | Sequence[Record],
     model: Element,
     *,
     free: Iterable[str] = (),
@@ -216,19 +216,20 @@ def fit_many(
     sensors: Sensors | None = None,
     steady: Steady = "exact",
 ) -> FitBatch:
-    """Estimate one model's parameters from each of many tables at once.
+    """Estimate one model's parameters from each of many tables, or of many records.
 
     Parameters
     ----------
-    tables : sequence of FrequencyResponse
-        With the same number of rows, quantity, harmonics and controlled variable.
+    data : sequence of FrequencyResponse or Record
+        Tables with the same number of rows, quantity, harmonics and controlled variable, which are
+        fitted at once; or records, each fitted on its own.
     model, free, fixed, noise, sensors, steady
         As for :func:`fit`.
 
     Returns
     -------
     FitBatch
-        Estimates of all tables, with combined uncertainties; ``batch[i]`` is the
+        All estimates, with combined uncertainties; ``batch[i]`` is the
         :class:`FitResult` of one of them, with everything that a single fit offers.
 
     Raises
@@ -252,10 +253,16 @@ def fit_many(
     >>> fit_many(tables, Dahl()).values.round(6).tolist()
     [[0.1, 30.0], [0.2, 30.0]]
     """
-    batch = ProblemBatch(
-        tables, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
-    )
-    return FitBatch(tuple(tables), solve_many(batch))
+    options: dict[str, Any] = {
+        "free": list(free),
+        "fixed": fixed,
+        "noise": noise,
+        "sensors": sensors,
+        "steady": steady,
+    }
+    if isinstance(data, list | tuple) and data and all(isinstance(one, Record) for one in data):
+        return FitBatch(tuple(fit(one, model, throw=False, **options).optimum for one in data))
+    return FitBatch(solve_many(ProblemBatch(data, model, **options)))
 
 
 def posterior(

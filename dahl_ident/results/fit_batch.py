@@ -1,4 +1,4 @@
-"""Fits of many tables at once: arrays of estimates, and the full result of each table."""
+"""Fits of many tables or records: arrays of estimates, and the full result of each."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from typing import Any, overload
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse
-from dahl_ident.fitting import OptimumBatch
+from dahl_ident.arrays import BoolArray, FloatArray
+from dahl_ident.fitting import Optimum, OptimumBatch
+from dahl_ident.fitting.optimum import Status
 from dahl_ident.results.fit_result import FitResult
-from dahl_ident.results.result import part
 
 
 @dataclass(frozen=True)
 class FitBatch(Sequence[FitResult]):
-    """One model fitted to each of S tables; made by :func:`dahl_ident.fit_many`.
+    """One model fitted to each of S tables or records; made by :func:`dahl_ident.fit_many`.
 
-    A sequence: ``batch[i]`` is the full result of table i.
+    A sequence: ``batch[i]`` is the full result of table or record i.
 
     Examples
     --------
@@ -34,11 +33,11 @@ class FitBatch(Sequence[FitResult]):
     (2, ['f_max', 'sigma'])
     """
 
-    tables: tuple[FrequencyResponse, ...]
-    optima: OptimumBatch
+    optima: OptimumBatch | tuple[Optimum, ...]
+    """Those of the searches alone; of tables, with arrays of all."""
 
     def __len__(self) -> int:
-        return len(self.tables)
+        return len(self.optima)
 
     @overload
     def __getitem__(self, index: int) -> FitResult: ...
@@ -54,11 +53,22 @@ class FitBatch(Sequence[FitResult]):
     @property
     def var_names(self) -> list[str]:
         """Names of the P free parameters."""
-        return list(self.optima.names)
+        return list(self.optima[0].names)
 
-    scale = part("optima.scale", "Standard deviation of the residuals, shape (S,).")
-    status = part("optima.status", "How each search ended.")
-    success = part("optima.success", "Whether each table has a finite optimum, shape (S,).")
+    @property
+    def scale(self) -> FloatArray:
+        """Standard deviation of the residuals, shape (S,)."""
+        return np.array([optimum.scale for optimum in self.optima])
+
+    @property
+    def status(self) -> tuple[Status, ...]:
+        """How each search ended."""
+        return tuple(optimum.status for optimum in self.optima)
+
+    @property
+    def success(self) -> BoolArray:
+        """Whether each has a finite optimum, shape (S,)."""
+        return np.array([optimum.success for optimum in self.optima])
 
     @cached_property
     def _params(self) -> FloatArray:
@@ -76,7 +86,6 @@ class FitBatch(Sequence[FitResult]):
         """Estimates, shape (S, P): those of ``batch[i].params``.
 
         The error model of each table takes some 10 ms and is computed once.
-        ``batch.optima.values`` are the optima of the search alone.
         """
         return np.asarray(self._params[..., 0])
 
@@ -84,7 +93,7 @@ class FitBatch(Sequence[FitResult]):
     def stderr(self) -> FloatArray:
         """Combined standard uncertainties of `values`, shape (S, P).
 
-        They are from noise alone if a table does not allow an estimate of other errors.
+        They are from noise alone where the data do not allow an estimate of other errors.
         """
         return np.asarray(self._params[..., 1])
 
@@ -94,7 +103,7 @@ class FitBatch(Sequence[FitResult]):
         return np.asarray(self._params[..., 2])
 
     def to_frame(self) -> Any:
-        """Return a pandas table: for each table a row of values and uncertainties.
+        """Return a pandas table: for each fit a row of values and uncertainties.
 
         Returns
         -------
@@ -114,4 +123,4 @@ class FitBatch(Sequence[FitResult]):
     def __repr__(self) -> str:
         counts = Counter(status.name.lower() for status in self.status)
         outcomes = ", ".join(f"{count} {name}" for name, count in counts.items())
-        return f"<FitBatch: {len(self)} tables, free {', '.join(self.var_names)}; {outcomes}>"
+        return f"<FitBatch: {len(self)} fits, free {', '.join(self.var_names)}; {outcomes}>"
