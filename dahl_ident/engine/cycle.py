@@ -12,7 +12,7 @@ import numpy as np
 from numba import boolean, complex128, float64, int64, njit, types
 
 from dahl_ident.engine.collocation import SHORTEST, STAGES
-from dahl_ident.engine.integrate import advance
+from dahl_ident.engine.integrate import Asked, Scratch, advance
 from dahl_ident.engine.radau import (
     FUNCTION,
     NUMBERS,
@@ -119,6 +119,9 @@ def cycles(
     no_array, no_parameters = np.empty(0), np.empty(0, dtype=np.int64)
     no_table, no_sums = np.empty((0, 0)), np.empty((0, 1 + q), dtype=np.complex128)
     sums = np.zeros((harmonics.size, 1 + q), dtype=np.complex128)
+    nothing = Asked(no_array, no_sums, no_array, no_array, no_table, no_table)
+    asked = Asked(harmonics, sums, no_array, no_array, no_table, no_table)
+    scratch = Scratch(solved, followers, w, at, block, sides)
     matrix, columns = np.zeros((free, free)), np.zeros((free, 2 + chosen.size))
     highest = 1.0
     for k in harmonics:
@@ -143,8 +146,6 @@ def cycles(
                     S[begin + i, i] = 1.0
                 step = advance(
                     f,
-                    solved,
-                    followers,
                     signal,
                     times,
                     x,
@@ -153,16 +154,8 @@ def cycles(
                     coarse * tolerance,
                     longest,
                     step,
-                    no_array,
-                    no_sums,
-                    no_array,
-                    no_array,
-                    no_table,
-                    no_table,
-                    w,
-                    at,
-                    block,
-                    sides,
+                    nothing,
+                    scratch,
                 )
                 if step <= 0.0:
                     break
@@ -195,29 +188,7 @@ def cycles(
             if held:
                 S[0, free] = 1.0
             sums[:] = 0.0
-            step = advance(
-                f,
-                solved,
-                followers,
-                signal,
-                times,
-                x,
-                S,
-                chosen,
-                tolerance,
-                longest,
-                step,
-                harmonics,
-                sums,
-                no_array,
-                no_array,
-                no_table,
-                no_table,
-                w,
-                at,
-                block,
-                sides,
-            )
+            step = advance(f, signal, times, x, S, chosen, tolerance, longest, step, asked, scratch)
             if step <= 0.0:
                 converged[row] = 0
                 continue

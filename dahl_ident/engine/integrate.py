@@ -5,6 +5,8 @@ Each step lies on one branch of the laws. Arguments are those of :mod:`dahl_iden
 
 from __future__ import annotations
 
+from collections import namedtuple
+
 import numpy as np
 
 from dahl_ident.engine.collocation import MATRIX, NODES, SLOPE_AFTER, STAGES
@@ -167,36 +169,23 @@ def finish_step(h, y, S, w, at):
         w[at.before + 1 + i] = w[at.values + (STAGES - 1) * m + n + 1 + i]
 
 
+Asked = namedtuple("Asked", "harmonics sums samples output by path")
+"""What is to be known of a motion: harmonics of the output are added to `sums`; the output at
+`samples`, its derivatives and the states are written to `output`, `by` and `path`."""
+
+Scratch = namedtuple("Scratch", "solved followers w at matrix columns")
+"""Which states are solved for, and which follow the displacement; arrays for the stages."""
+
+
 @compiled
-def advance(
-    f,
-    solved,
-    followers,
-    signal,
-    times,
-    y,
-    S,
-    chosen,
-    tolerance,
-    longest,
-    step,
-    harmonics,
-    sums,
-    samples,
-    output,
-    by,
-    path,
-    w,
-    at,
-    matrix,
-    columns,
-):
+def advance(f, signal, times, y, S, chosen, tolerance, longest, step, asked, scratch):
     """Integrate from times[0] to times[1], in place; return a length of step, 0 if it fails.
 
     `longest` is the longest step. `step` is a guess of the first step, and of the first after a
-    turning point; a better one is returned. Harmonics of the output are added to `sums`; the output
-    at `samples`, its derivatives and the states are written to `output`, `by` and `path`.
+    turning point; a better one is returned.
     """
+    harmonics, sums, samples, output, by, path = asked
+    solved, followers, w, at, matrix, columns = scratch
     q = S.shape[1]
     first = q - chosen.size - 1
     t, end = times[0], times[1]

@@ -6,7 +6,7 @@ import numpy as np
 from numba import float64, int64, njit, types
 
 from dahl_ident.engine.collocation import STAGES
-from dahl_ident.engine.integrate import advance
+from dahl_ident.engine.integrate import Asked, Scratch, advance
 from dahl_ident.engine.radau import (
     FUNCTION,
     NUMBERS,
@@ -70,27 +70,8 @@ def march(
     output, by, path = np.empty(N), np.empty((N, q)), np.empty((N, n))
     times = np.array([samples[0], samples[N - 1]])
     step = knots[1] - knots[0]
-    done = advance(
-        f,
-        solved,
-        followers,
-        signal,
-        times,
-        y,
-        S,
-        chosen,
-        tolerance,
-        np.inf,
-        step,
-        np.empty(0),
-        np.empty((0, 1 + q), dtype=np.complex128),
-        samples,
-        output,
-        by,
-        path,
-        w,
-        at,
-        matrix,
-        columns,
-    )
+    no_sums = np.empty((0, 1 + q), dtype=np.complex128)
+    asked = Asked(np.empty(0), no_sums, samples, output, by, path)
+    scratch = Scratch(solved, followers, w, at, matrix, columns)
+    done = advance(f, signal, times, y, S, chosen, tolerance, np.inf, step, asked, scratch)
     return int(done > 0.0), output, by, path, S
