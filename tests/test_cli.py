@@ -55,7 +55,8 @@ def test_command_line_and_python_give_the_same_numbers(run):
         (("datasets", "nosuch"), "there is no data set 'nosuch'; there are"),
         (("datasets", "-o", "x.csv"), "--output needs the name of a data set"),
         (("sample", "-", "--prior", "f_max"), "prior is 'f_max'; expected a name and two bounds"),
-        (("fit", "-", "--config", "absent.toml"), "absent.toml: no TOML file of options"),
+        (("fit", "."), "error: . is a folder; give the path of a file in it"),
+        (("fit", "-", "--config", "absent.toml"), "absent.toml is not a TOML file of options"),
     ],
 )
 def test_bad_input_says_what_was_expected(run, arguments, message):

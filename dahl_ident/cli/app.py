@@ -64,7 +64,10 @@ def common(
         bool, typer.Option("--color/--no-color", help="Colour; NO_COLOR turns it off as well.")
     ] = True,
     _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Identify friction from measurements, with an uncertainty budget."""

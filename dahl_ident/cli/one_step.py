@@ -79,7 +79,8 @@ def export(
     to: Annotated[
         str,
         option(
-            "Format: a simulator, a controller, a paper, or other budgets.",
+            "Format, for a simulator, a controller, a paper or other budgets: mujoco, "
+            "mujoco-frictionloss, urdf, modelica, matlab, c, gtc, ufloat, latex or draws.",
             one_of="mujoco|mujoco-frictionloss|urdf|modelica|matlab|c|gtc|ufloat|latex|draws",
         ),
     ] = "",

@@ -38,7 +38,7 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
     try:
         content = tomllib.loads(read_text(path))
     except (DataError, tomllib.TOMLDecodeError) as exc:
-        raise DataError(f"{path}: no TOML file of options: {exc}") from exc
+        raise DataError(f"{path} is not a TOML file of options: {exc}") from exc
     command = ctx.info_name or ""
     tables = {k: v for k, v in content.items() if isinstance(v, dict)}
     shared = {k.replace("-", "_"): v for k, v in content.items() if k not in tables}
@@ -185,7 +185,11 @@ class General:
     panel: ClassVar[str | None] = None
     json: bool = setting("Print JSON.", False, "--json")
     quiet: bool = setting(
-        "Print errors, and what goes to -, alone.", False, "--quiet", "-q", callback=_silence
+        "Print only errors, and what is written to standard output (-).",
+        False,
+        "--quiet",
+        "-q",
+        callback=_silence,
     )
     config: Path | None = setting(
         "TOML file of options; a table named after a command, such as \\[fit], applies to "

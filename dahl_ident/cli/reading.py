@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # options of tables that records have as well
 _RECORD_OPTIONS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
-_COLUMN = 'Its column, with unit if needed: "x \\[mm]".'
+_COLUMN = 'Name of its column, with its unit if the header has none: "x \\[mm]".'
 # what conditions can name, in addition to phase_deg and the measures of quality
 _COLUMNS = ("frequency_hz", "amplitude", "drive", "gain", "harmonic", "level", "run")
 _COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 METADATA_MARK = "dahl_ident:"
-_IRREGULAR = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
+_IRREGULAR = {stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
 
 
 def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -70,6 +70,8 @@ def regular(path: str | Path, what: str = "the file") -> Path:
     except (OSError, ValueError) as exc:
         why = getattr(exc, "strerror", None) or exc
         raise DataError(f"{path}: {what} cannot be read: {why}") from exc
+    if kind == stat.S_IFDIR:
+        raise DataError(f"{path} is a folder; give the path of a file in it")
     if kind != stat.S_IFREG:
         raise DataError(
             f"{path} is a {_IRREGULAR.get(kind, 'device')}; expected a file: copy what it holds "

@@ -119,13 +119,17 @@ def _noise(rms: float, hints: Sequence[str], scatter: str) -> str:
 
 def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> str:
     which = joined(names, _MOST_ROWS)
-    them, named = "them", f"Only {len(names)} of {rows} rows ({which}) contradict"
+    them, these, named = (
+        "them",
+        "these rows",
+        f"Only {len(names)} of {rows} rows ({which}) contradict",
+    )
     if len(names) == 1:
-        them, named = "it", f"Only the row at {names[0]} contradicts"
+        them, these, named = "it", "this row", f"Only the row at {names[0]} contradicts"
     left = remaining[0].lower() + remaining[1:].rstrip(".")
     return (
         f"{named} the model ({percent(rms)} rms misfit): without {them} {left}. The fit includes "
-        f"every row: check {them}, or fit with {argument('loss', 'huber')}, which down-weights "
+        f"{these}: check {them}, or fit with {argument('loss', 'huber')}, which down-weights "
         f"{them}."
     )
 
