@@ -49,6 +49,7 @@ from dahl_ident.elements import (
 from dahl_ident.elements.element import Alternative, as_model
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
+from dahl_ident.fitting.optimum import NO_EFFECT
 from dahl_ident.problem import Problem
 from dahl_ident.units import percent
 
@@ -358,8 +359,8 @@ def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str
             at_moved = friction_quantities(optimum.problem, values_at(optimum.problem, moved))
             with np.errstate(all="ignore"):
                 changes[:, i] += np.array([at_moved[n] for n in names]) / at_optimum / (2.0 * step)
-    with np.errstate(over="ignore", invalid="ignore"):  # far from determined
-        stds = Information(optimum).std(np.nan_to_num(changes))
+    changes = np.clip(np.nan_to_num(changes), -1.0 / NO_EFFECT, 1.0 / NO_EFFECT)
+    stds = Information(optimum).std(changes)
     return [n for n, u in zip(names, stds.tolist(), strict=True) if not u <= NOT_IDENTIFIED_ABOVE]
 
 

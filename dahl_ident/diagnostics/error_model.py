@@ -435,7 +435,6 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
     return MixedModel(estimate.y, estimate.columns, Z, group, np.array(known), 1 + both, most)
 
 
-@np.errstate(over="ignore")
 def _unit_covariances(lever: FloatArray, state: MixedState) -> FloatArray:
     """Return the estimate's covariances by noises, sources, priors of unit size: (k, Q, Q)."""
     model, G = state.model, state.model.noises

@@ -9,7 +9,7 @@ import numpy as np
 from dahl_ident.arrays import TINY, BoolArray, FloatArray
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart
-from dahl_ident.fitting.optimum import NOTICEABLE_PART, UNDETERMINED
+from dahl_ident.fitting.optimum import NO_EFFECT, NOTICEABLE_PART, UNDETERMINED
 from dahl_ident.problem import TableProblem
 
 NOTICED = 1e-5  # singular value over the largest, below which a direction is undetermined
@@ -117,7 +117,7 @@ class Basis:
         """Return the directions that residuals with the Jacobian J determine."""
         slopes = chart.derivative(theta)
         columns = J @ slopes
-        size = 1.0 / np.maximum(np.linalg.norm(columns, axis=0), TINY)
+        size = 1.0 / np.maximum(np.linalg.norm(columns, axis=0), NO_EFFECT)
         _, singular, directions = np.linalg.svd(columns * size, full_matrices=False)
         return cls(size, directions[singular > NOTICED * singular[0]].T, slopes, chart)
 

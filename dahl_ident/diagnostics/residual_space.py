@@ -28,12 +28,12 @@ from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.diagnostics.estimate import WeightedEstimate, scores_of
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
+from dahl_ident.fitting.optimum import NO_EFFECT
 from dahl_ident.problem import TableProblem
 
 _RUN_STEPS = 2  # of Gauss-Newton, from the linear mixed model's deviations of runs
 _RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as zero
 _GAUSSIAN = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
-_NOTHING = 1e-100  # length of a column that counts as zero
 _LEFT = 1e-4  # length of a column after projection, over that before, that counts as zero
 
 
@@ -277,7 +277,7 @@ class ResidualSpace(_Complement):
 def orthonormal(columns: FloatArray, least: float = _RANK) -> FloatArray:
     """Return an orthonormal basis of the column space, shape (m, rank)."""
     size = np.abs(columns).max(axis=0, initial=0.0)
-    nonzero = (size > _NOTHING) & np.isfinite(size)
+    nonzero = (size > NO_EFFECT) & np.isfinite(size)
     if not nonzero.any():
         return np.zeros((len(columns), 0))
     used = columns[:, nonzero] / size[nonzero]  # squares of very small numbers underflow

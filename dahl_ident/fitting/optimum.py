@@ -23,7 +23,9 @@ _LONGEST_SECANT = 20.0  # longest step of the secant, in plain steps
 _AT_BOUND = 1e-8  # relative distance from a bound within which an estimate lies at it
 UNDETERMINED = 1e-13  # eigenvalue of the information, of unit diagonal, up to which it is rounding
 NOTICEABLE_PART = 1e-4  # component in such a direction above which a parameter is undetermined
-_NOTHING = 1e-100  # root of the information on a parameter that counts as zero
+# root of the information on a parameter, or length of a column, that counts as zero; the fourth
+# power of its inverse, as in degrees of freedom, is still a number
+NO_EFFECT = 1e-50
 _BARELY = 1.001  # scale over that of rounding, below which residuals are rounding errors
 
 
@@ -478,7 +480,7 @@ def inverse(information: FloatArray) -> tuple[FloatArray, BoolArray]:
     if not finite.all():
         information = np.where(finite.all(axis=(-2, -1), keepdims=True), information, 0.0)
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
-    size = np.where(size > _NOTHING, size, 1.0)
+    size = np.where(size > NO_EFFECT, size, 1.0)
     sizes = size[..., :, None] * size[..., None, :]
     values, vectors = np.linalg.eigh(information / sizes)
     null = values <= UNDETERMINED * np.maximum(1.0, values[..., -1:])
