@@ -18,7 +18,6 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.units import Motion, shown_unit
 
-_UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
 _LONG_ENOUGH = 0.02  # share of samples near reversals that suffices
 _INDISTINGUISHABLE = 0.95  # correlation at which two parameters cannot be distinguished
 _BECAUSE = {  # reasons and remedies by the largest source of uncertainty
@@ -147,24 +146,22 @@ def _spring_advice(optimum: Optimum, lost: frozenset[str]) -> str:
     return "because its force is below the noise of the response: measure where it is larger"
 
 
-def reasons(model: Model, problem: RecordProblem, errors: RecordErrors) -> dict[str, str]:
-    """Return why records do not determine parameters whose u is above 30 %, by name.
+def record_advice(
+    model: Model, problem: RecordProblem, errors: RecordErrors, lost: Sequence[str]
+) -> dict[str, str]:
+    """Return "because ...: do ..." for parameters that records do not determine, by name.
 
     `model` has the estimates put in.
     """
-    free = {p.name: i for i, p in enumerate(problem.free)}
+    places = {p.name: i for i, p in enumerate(problem.free)}
     paths = [stretches(r.displacement) for r in problem.records if r.displacement is not None]
     why = {}
     for element in model.elements:
-        for parameter in (p for p in element.parameters if p.name in free):
-            i = free[parameter.name]
-            error = float(errors.covariance[i, i]) ** 0.5
-            value = abs(float(parameter.value or 0))
-            # a parameter that may be zero, such as an asymmetry, is compared with its bounds
-            limit = min(parameter.upper, -parameter.lower) if parameter.lower < 0.0 else 0.0
-            if error > _UNCERTAIN * max(limit if np.isfinite(limit) else 0.0, value):
-                missing = _missing_motion(element, paths, problem.motion, known=error < value)
-                why[parameter.name] = missing or _largest_source(problem, errors, i)
+        for parameter in (p for p in element.parameters if p.name in lost):
+            i = places[parameter.name]
+            known = float(errors.covariance[i, i]) ** 0.5 < abs(float(parameter.value or 0))
+            missing = _missing_motion(element, paths, problem.motion, known=known)
+            why[parameter.name] = f"because {missing or _largest_source(problem, errors, i)}"
     return why
 
 
@@ -177,7 +174,7 @@ def _missing_motion(
     """
     farthest = max((float(p.path.max()) for p in paths), default=np.nan)
     if farthest == 0.0:
-        return ": the displacement is constant; move"
+        return "the displacement is constant: move"
     if not element.has_memory or not paths:
         return ""
     values = [np.asarray(p.value if p.value is not None else 0.0) for p in element.parameters]
@@ -186,12 +183,12 @@ def _missing_motion(
     if farthest < 2.0 * low:
         needs = f"{2.0 * high:.2g} {unit}" if known else "more"
         return (
-            f": the motion moves no farther than {farthest:.2g} {unit} after a reversal, and slip "
-            f"needs {needs}; move farther"
+            f"the motion moves no farther than {farthest:.2g} {unit} after a reversal, and slip "
+            f"needs {needs}: move farther"
         )
     if np.mean(np.concatenate([p.path < 2.0 * low for p in paths])) < _LONG_ENOUGH:
         return (
-            f": the motion never stays below x_c = {low:.2g} {unit} long enough; add reversals and "
+            f"the motion never stays below x_c = {low:.2g} {unit} long enough: add reversals and "
             "small motions of that size, sampled closely"
         )
     return ""
@@ -202,11 +199,11 @@ def _largest_source(problem: RecordProblem, errors: RecordErrors, place: int) ->
     covariance = errors.covariance
     for source, C in errors.contributions.items():
         if source in _BECAUSE and 0.5 * covariance[place, place] < C[place, place] < np.inf:
-            return f" because {_BECAUSE[source]}"
+            return _BECAUSE[source]
     with np.errstate(all="ignore"):
         size = np.sqrt(covariance.diagonal())
         alike = np.abs(covariance[place] / size / size[place]) > _INDISTINGUISHABLE
     others = [n for i, n in enumerate(problem.names) if alike[i] and i != place]
     if others:
-        return f": it cannot be distinguished from {', '.join(others)}; fix one of them"
-    return ": its effect is small compared with the residuals; fix it, or leave the element out"
+        return f"it cannot be distinguished from {', '.join(others)}: fix one of them"
+    return "its effect is small compared with the residuals: fix it, or leave the element out"

@@ -98,16 +98,7 @@ def judgement(fit: Assessed) -> Judgement:
 # Determined?
 
 
-@_of_records
-def _parameters_of_records(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield the parameters that are not determined, why, and which motion would determine them."""
-    for name, why in fit.undetermined.items():
-        stderr, unit = fit.known[1][name], fit.identifiability.parameters[name].unit
-        yield undetermined("record_parameter", name=name, stderr=stderr, unit=unit, why=why)
-
-
-@_of_tables
-def _parameters(fit: TableAssessment) -> Iterator[Finding]:
+def _parameters(fit: Assessed) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
     if fit.goodness.sign:
         return  # with the wrong sign, parameters have no meaning
@@ -117,7 +108,7 @@ def _parameters(fit: TableAssessment) -> Iterator[Finding]:
         yield known.finding
     if noise_known and not known.complete and known.combinations:
         yield undetermined("combinations", combinations=tuple(map(str, known.combinations)))
-    if not optimum.success:
+    if not fit.success:
         message = optimum.status.value if optimum.status.at_infinity else optimum.message
         yield undetermined("solver", message=message)
     if optimum.dof <= 0:
@@ -147,8 +138,6 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
     far = fit.goodness.rms_in_band > (_FAIRLY if fit.exceeds_noise else _TOO_LARGE)
     if far:
         yield described("records_not_described", _NOT_DESCRIBED, rms=fit.goodness.rms_in_band)
-    if not converged:
-        yield described("no_optimum", _NOT_DESCRIBED, message=fit.optimum.message)
     displaced = all(record.displacement is not None for record in problem.records)
     if problem.output == "motion" and (far or not converged) and displaced:
         yield described("motion_may_be_imposed", _NOT_DESCRIBED)
@@ -450,7 +439,6 @@ RESERVATIONS: tuple[_Check, ...] = (
 CHECKS: tuple[_Check, ...] = (
     _constraints,
     _parameters,
-    _parameters_of_records,
     _misfit_of_table,
     _misfit_of_records,
     _weak_elements,

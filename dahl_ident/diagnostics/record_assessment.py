@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.arrays import TINY, FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
-from dahl_ident.diagnostics.advice import reasons
+from dahl_ident.diagnostics.advice import record_advice
 from dahl_ident.diagnostics.assessment import Assessment, ContradictedExponent
 from dahl_ident.diagnostics.bands import DerivedQuantity, quantities_and_slopes
 from dahl_ident.diagnostics.budget import Budget, parameter_budget
@@ -32,8 +32,15 @@ from dahl_ident.diagnostics.record_errors import (
     errors_on_constraints,
     record_errors,
 )
-from dahl_ident.diagnostics.verdicts import Identifiability, ParameterVerdict, Verdict
-from dahl_ident.elements import Element, Model
+from dahl_ident.diagnostics.verdicts import (
+    FIRST_ORDER_UP_TO,
+    IDENTIFIED_BELOW,
+    Identifiability,
+    ParameterVerdict,
+    Verdict,
+    within,
+)
+from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.losses import loss_named
@@ -262,20 +269,23 @@ class RecordAssessment(Assessment):
         )
 
     @cached_property
-    def undetermined(self) -> Mapping[str, str]:
-        """Why parameters are not determined, by name."""
-        return reasons(self.model, self.problem, self.errors)
-
-    @cached_property
     def identifiability(self) -> Identifiability:
-        """Which parameters the records determine."""
-        why, limits = self.undetermined, self.intervals("combined")
-        verdicts: dict[str, ParameterVerdict] = {}
-        for name, unit in zip(self.problem.names, limits.units, strict=False):
-            verdict = Verdict.NOT_IDENTIFIED if name in why else Verdict.IDENTIFIED
-            text = f"not determined{why[name]}" if name in why else verdict.value
-            verdicts[name] = ParameterVerdict(name, unit, verdict, limits[name][1], text)
-        return Identifiability(verdicts, (), {})
+        """Which parameters of the model the records determine."""
+        free, limits = self.problem.free, self.intervals("combined")
+        verdicts = {}
+        for p, direction in zip(free, np.eye(len(self.covar)), strict=False):
+            u = float(self.errors.std(direction)) / _natural_size(p, self.known[0][p.name])
+            U = coverage_factor(self.errors.dof(direction)) * u
+            verdict = Verdict.WEAK if 0.5 * U > IDENTIFIED_BELOW else Verdict.IDENTIFIED
+            verdicts[p.name] = verdict if u <= FIRST_ORDER_UP_TO else Verdict.NOT_IDENTIFIED
+        lost = [name for name, verdict in verdicts.items() if verdict is Verdict.NOT_IDENTIFIED]
+        why = record_advice(self.model, self.problem, self.errors, lost)
+        parameters = {}
+        for (name, verdict), unit in zip(verdicts.items(), limits.units, strict=False):
+            _, shown, _ = limits[name]
+            text, reason = within(shown, unit), why.get(name, "")
+            parameters[name] = ParameterVerdict(name, unit, verdict, shown, text, reason)
+        return Identifiability(parameters, (), {})
 
     @property
     def constraint_cost(self) -> ConstraintCost | None:
@@ -468,6 +478,15 @@ class RecordAssessment(Assessment):
                 HeldOutPart(number, first, last, len(piece), band.rms_share, float(inside))
             )
         return HoldOut(tuple(left_out))
+
+
+def _natural_size(parameter: Parameter, value: float) -> float:
+    """Return what the uncertainty of a parameter is compared with.
+
+    Its value; its bounds for one that may be zero, such as an asymmetry, if they are larger.
+    """
+    limit = min(parameter.upper, -parameter.lower) if parameter.lower < 0.0 else 0.0
+    return max(limit if np.isfinite(limit) else 0.0, abs(value), TINY)
 
 
 @dataclass(frozen=True)

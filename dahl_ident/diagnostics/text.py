@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from string import Formatter
@@ -87,13 +86,6 @@ def _no_degrees_of_freedom(numbers: int, parameters: int, scale_known: bool) -> 
         f"{numbers} numbers and {parameters} parameters leave no degree of freedom to judge "
         f"{judged}: measure more points."
     )
-
-
-def _record_parameter(name: str, stderr: float, unit: str, why: str) -> str:
-    if math.isinf(stderr):
-        return f"{name} is not determined at all{why}."
-    size = " ".join(filter(None, [f"{stderr:.2g}", unit]))
-    return f"{name} is not determined (standard uncertainty {size}){why}."
 
 
 # Described?
@@ -336,7 +328,6 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "describing_function": "The force was held, but the describing function predicts the motion: "
     "{why}.",
     "records_not_described": "The model does not describe the records ({rms:percent} rms misfit).",
-    "no_optimum": "The search found no optimum. {message}",
     "motion_may_be_imposed": lambda: (
         "If the exciter imposed the motion, fit the force instead "
         f"({argument('output', 'force', option='predicted')}): what it moves hardly depends on the "
@@ -348,7 +339,6 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     ),
     "slow_misfit": "The residuals, {rms:percent} rms, vary slowly. So does some noise, and so does "
     "the error of a law that is not right: the records cannot tell which it is.",
-    "record_parameter": _record_parameter,
     "unphysical": "Physically doubtful: {objection}.",
     "stated_exponent": "The records contradict {name} = {held:g}, which was stated: they ask for "
     "{wanted}.",
@@ -368,7 +358,7 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "without it. A quieter displacement would determine more.",
     "effective_samples": lambda effective, samples: (
         "Error bars take the residuals' correlation into account: "
-        f"{min(effective, samples):.0f} effective of {samples} samples."
+        f"{effective:.0f} effective of {samples} samples."
     ),
     "not_converged": "{message}",
     "sampled": "{message}",

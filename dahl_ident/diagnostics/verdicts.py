@@ -7,7 +7,8 @@ interval over that of a normal distribution with unit standard deviation). A wea
 parameter whose profile is still open at 99.73 % is not identified. Where every first-order value is
 below 0.15, profiles are not computed: they would differ in the second digit. Parameters that may be
 zero or negative have no logarithm; for them it is the standard deviation over their size, or over a
-tenth of the size at which they would make up the whole response, whichever size is larger.
+tenth of the size at which they would make up the whole response, whichever size is larger. The
+parameters of records are judged to first order, and are not identified above 0.3.
 
 Where parameters are not identified, combinations of them may be
 (:mod:`dahl_ident.diagnostics.combinations`); where no known combination fits, the least
@@ -46,6 +47,7 @@ from dahl_ident.fitting import Optimum
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
+FIRST_ORDER_UP_TO = 0.3  # the same: beyond it, intervals without profiles do not hold
 _NEARLY_LINEAR = 0.15  # u of every logarithm: below it, profiles differ in the second digit
 # Largest u of a logarithm from sources that rest on assumptions: the exponent's range, and the
 # smoothness of a model error.
@@ -86,7 +88,7 @@ class ParameterVerdict:
     verdict: Verdict
     # at 95.45 %: combined, of the profile, or of first order
     interval: Interval
-    known_text: str  # interval and verdict in words
+    known_text: str  # the interval, or what is known instead, in words
     why: str = ""  # the reason, and what to do, where it is not identified
 
     @property
@@ -97,7 +99,10 @@ class ParameterVerdict:
     @property
     def reason(self) -> str:
         """Interval and verdict in words, with the reason if it is not identified."""
-        return f"{self.known_text}, not determined, {self.why}" if self.why else self.known_text
+        if self.why:
+            return f"{self.known_text}, not determined, {self.why}"
+        lost = self.verdict is Verdict.NOT_IDENTIFIED
+        return self.known_text if lost else f"{self.known_text}, {self.verdict.value}"
 
 
 @dataclass(frozen=True)
@@ -254,7 +259,7 @@ def judged(
     for name, parameter in zip(problem.names, problem.parameters, strict=True):
         unit = parameter.unit
         _, limits, widest = stated[name]
-        shown, why = _within(limits, unit), ""
+        shown, why = within(limits, unit), ""
         if name in ambiguous:
             shown = ambiguous[name]
         elif name in not_by_noise and errors is not None:
@@ -262,8 +267,6 @@ def judged(
             why = not_by_noise[name]
         elif verdicts[name] is Verdict.NOT_IDENTIFIED:
             why = advice(optimum, name, widest, lost)
-        else:
-            shown = f"{shown}, {verdicts[name].value}"
         parameters[name] = ParameterVerdict(name, unit, verdicts[name], limits, shown, why)
     direction = {}
     if lost - ambiguous.keys() and not determined:
@@ -412,6 +415,7 @@ def _combinations(
         yield StatedCombination(name, sources[name].unit, sources[name].value, sources[name].u)
 
 
-def _within(limits: Interval, unit: str) -> str:
+def within(limits: Interval, unit: str) -> str:
+    """Return an interval with its level; an open side in words."""
     lower = -np.inf if limits.lower == 0.0 else limits.lower
     return f"{interval_text(lower, limits.upper, unit)} ({level_text(limits.level)})"

@@ -391,7 +391,7 @@ def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> I
 
 def _fit_facts(fit: FitResult) -> dict[str, Any]:
     """Return a fit as plain data for JSON."""
-    intervals = fit.conf_interval().at(CONFIDENCE)
+    intervals, judged = fit.conf_interval().at(CONFIDENCE), fit.identifiability.parameters
     return {
         "model": repr(fit.problem.model),
         "equations": list(in_words(fit.problem.model)),
@@ -404,7 +404,7 @@ def _fit_facts(fit: FitResult) -> dict[str, Any]:
                 "fixed": not e.vary and name not in fit.assumed,
                 "assumed": name in fit.assumed,
                 "interval_95.45": list(intervals[name][1:]) if name in intervals else None,
-                "verdict": fit.verdict_on(name)[0].value if e.vary else None,
+                "verdict": fit.verdict_on(name)[0].value if name in judged else None,
             }
             for name, e in fit.params.items()
         },

@@ -161,7 +161,7 @@ def parameters(
     rows = []
     for name, p in fit.params.items():
         value, error = rounded(p.value, p.stderr)
-        struck = name in fit.var_names and not is_usable(fit, name)
+        struck = name in fit.identifiability.parameters and not is_usable(fit, name)
         shown = estimated(p.value, value, struck=struck)
         u = Cell(error if p.vary else "fixed", _finite(p.stderr), struck)
         if name in fit.assumed:

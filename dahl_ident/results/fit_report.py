@@ -105,7 +105,8 @@ def _parameters(
             limits = intervals[name][-1]
             open_below = p.min == 0.0 and limits.lower == 0.0
             within = interval(-math.inf if open_below else limits.lower, limits.upper, "")
-        word = fit.identifiability.parameters[name].verdict.value
+        known = fit.identifiability.parameters.get(name)
+        word = "of the record" if known is None else known.verdict.value
         rows.append([name, value, error, p.unit, within, word])
     return [*table(rows, left=(0, 3, 4, 5)).splitlines(), f"({intervals.note})"]
 
