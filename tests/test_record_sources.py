@@ -44,7 +44,7 @@ def test_an_assumed_exponent_is_as_uncertain_as_a_free_one_with_a_noisy_displace
     x = np.interp(t, np.linspace(0.0, 24.0, 6), level) * np.sin(2.0 * np.pi * t)
     noise = np.random.default_rng(2).standard_normal((2, t.size))
     force = di.Dahl(0.1, 30.0).force(x) + 3e-4 * noise[0]
-    record = di.Record(t, displacement=x + 1e-6 * noise[1], force=force)
+    record = di.Record(t, displacement=x + 1e-5 * noise[1], force=force)
     assumed, free = di.fit(record, di.Dahl()), di.fit(record, di.Dahl(alpha=None))
     assert "noise in the displacement" in sources(free, "alpha")
     for name in ("f_max", "sigma", "alpha"):

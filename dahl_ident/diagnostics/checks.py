@@ -370,10 +370,11 @@ def _notes(fit: RecordAssessment) -> Iterator[Finding]:
     yield described("record_residuals", **size)
     if problem.whitening.size > 1:
         yield described("slow_residuals", rms=goodness.rms_in_band)
-    if problem.displacement_noise:
+    if problem.displacement_noise or problem.is_smoothed:
         yield described(
             "displacement_noise",
-            noise=problem.displacement_noise,
+            treatment="not counted as travel" if problem.displacement_noise else "smoothed out",
+            noise=problem.estimated_noise if problem.is_smoothed else problem.displacement_noise,
             unit=si_unit("displacement", problem.motion),
             travel=problem.noise_travel,
         )

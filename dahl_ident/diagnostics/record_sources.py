@@ -213,7 +213,7 @@ def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float,
     i = free.names.index(name)
     (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
     begin = free.to_search(np.insert(fit.values, i, value))
-    cost, free = float(free.quadratic(begin).cost), free.without_noise(0.0)
+    cost, free = float(free.quadratic(begin).cost), free.smoothed(on=False).without_noise(0.0)
     end = search.descend(free, begin, STEPS)
     if problem.output == "force":
         free, end = search.without_noise(free, end)

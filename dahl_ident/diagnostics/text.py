@@ -354,8 +354,8 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "slow_residuals": "Most of this varies slowly, as noise in the drive causes it: {rms:percent} "
     "rms remains at the drive's frequencies, and the residuals are weighted by their spectrum.",
     "displacement_noise": "The displacement's noise of {noise:.2g} {unit} (standard deviation) is "
-    "not counted as travel, of which it would add {travel:percent}; the residuals are smaller "
-    "without it. A quieter displacement would determine more.",
+    "{treatment}; it would add {travel:percent} of travel, and the residuals are smaller without "
+    "it. A quieter displacement would determine more.",
     "effective_samples": lambda effective, samples: (
         "Error bars take the residuals' correlation into account: "
         f"{effective:.0f} effective of {samples} samples."

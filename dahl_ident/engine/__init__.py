@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from dahl_ident.engine.motion import Loops, Marched, Settled, loops, march, settled
 from dahl_ident.engine.periodic import SteadyMotion, steady_motions
-from dahl_ident.engine.sampled import band_limited, differentiated
+from dahl_ident.engine.sampled import (
+    band_limited,
+    differentiated,
+    filter_window,
+    noise_left,
+    smoothed,
+)
 from dahl_ident.engine.translate import Equations, System, translate
 
 __all__ = [
@@ -16,9 +22,12 @@ __all__ = [
     "System",
     "band_limited",
     "differentiated",
+    "filter_window",
     "loops",
     "march",
+    "noise_left",
     "settled",
+    "smoothed",
     "steady_motions",
     "translate",
 ]

@@ -17,7 +17,7 @@ _SMOOTH = 0.8  # fraction of half the sampling rate above which a smooth extensi
 
 
 def differentiated(
-    samples: FloatArray, interval: float, stretch: float = 1.0
+    samples: FloatArray, interval: float, window: int | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return the first and second derivative of evenly sampled values.
 
@@ -25,7 +25,7 @@ def differentiated(
     (1964) 1627-1639). The window is the longest odd number of samples, at least 5, whose pass
     band, about (degree + 1)/(3.2 half-width - 4.6) of half the sampling rate, is four times as wide
     as the band with 99.99 % of the velocity's power, or, if that is narrower, in which it exceeds
-    the displacement's white noise. `stretch` is a factor on its length.
+    the displacement's white noise. A `window` of so many samples takes its place.
 
     Examples
     --------
@@ -34,15 +34,42 @@ def differentiated(
     >>> bool(abs(a[200] + (2.0 * np.pi) ** 2 * np.sin(2.0 * np.pi * t[200])) < 0.05)
     True
     """
+    window = window or filter_window(samples)
+    return _filtered(samples, window, 1, interval), _filtered(samples, window, 2, interval)
+
+
+def smoothed(samples: FloatArray, window: int | None = None) -> FloatArray:
+    """Return evenly sampled values, smoothed in the window in which they are differentiated.
+
+    Examples
+    --------
+    >>> t = np.arange(4000) / 1000.0
+    >>> noise = 1e-3 * np.random.default_rng(0).standard_normal(t.size)
+    >>> bool(np.std(smoothed(np.sin(t) + noise) - np.sin(t)) < 2e-4)
+    True
+    """
+    return _filtered(samples, window or filter_window(samples), 0, 1.0)
+
+
+def noise_left(window: int) -> float:
+    """Return the standard deviation of white noise after smoothing, over that before.
+
+    Examples
+    --------
+    >>> round(noise_left(5), 3), round(noise_left(101), 3)
+    (1.0, 0.186)
+    """
+    from scipy.signal import savgol_coeffs  # slow to import, and rarely needed
+
+    return float(np.linalg.norm(savgol_coeffs(window, _DEGREE)))
+
+
+def _filtered(samples: FloatArray, window: int, order: int, interval: float) -> FloatArray:
     from scipy.signal import savgol_filter  # slow to import, and rarely needed
 
-    half = max(2, round(stretch * (filter_window(samples) // 2)))
-    window = min(2 * half + 1, samples.size - 1 + samples.size % 2)
+    window = min(window, samples.size - 1 + samples.size % 2)
     degree = min(_DEGREE, window - 1)
-    first, second = (
-        savgol_filter(samples, window, degree, deriv=order, delta=interval) for order in (1, 2)
-    )
-    return np.asarray(first), np.asarray(second)
+    return np.asarray(savgol_filter(samples, window, degree, deriv=order, delta=interval))
 
 
 def filter_window(samples: FloatArray) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -39,7 +40,7 @@ _SAME_NOISE = 1.3  # factor within which the noise is known
 _SETTLING = 2000  # samples after which simulated noise is stationary
 _DESCRIBED = 0.1  # unexplained share of variance that shows a wrong model, not a noisy drive
 _REWEIGHTINGS = 12  # most iterations of the weights
-_BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
+_BANDS = 0.0, 1.0, 2.0, 4.0  # dead bands tried, in units of the noise that differences show
 _ALIGNED = 0.02  # part of the sum of squares that a delay has to explain to be removed
 _LONGEST_DELAY = 2.0  # samples: twice the assumed standard deviation
 _ALIGNMENTS = 4  # most steps of the delay: each is a hundredth of the one before
@@ -236,34 +237,29 @@ class RecordSearch:
     def without_noise(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate without the displacement's noise, if the residuals become smaller.
 
-        Noise that counts as travel changes the friction force where the device rests. The dead band
-        is doubled as long as the residuals after a Gauss-Newton step become smaller, up to four
-        times the estimated noise: correlated noise shows less in differences, but a wider band
-        would be play.
+        Noise that counts as travel changes the friction force where the device rests or is slow.
+        The displacement is smoothed, or movements within a dead band are not counted, or both,
+        whichever leaves the smallest residuals. The band is of one, two or four times the estimated
+        noise: correlated noise shows less in differences, but a wider band would be play.
         """
-        theta, least = plain.theta[0], float(plain.cost[0])
-        noise, before = problem.estimated_noise, least
-        if not plain.converged[0] or not problem.with_memory or noise == 0.0:
+        theta, best, lowest = plain.theta[0], problem, plain
+        if not plain.converged[0] or not problem.with_memory or problem.estimated_noise == 0.0:
             return problem, plain
-        best = problem
-        for _ in range(_BANDS):
-            trial = problem.without_noise(noise)
-            at = trial.quadratic(theta)
-            self.evaluations += 1
-            predicted = float(at.cost) - 0.5 * float(
-                at.gradient @ np.linalg.pinv(at.hessian, hermitian=True) @ at.gradient
-            )
-            if not predicted < least:
-                break
-            best, least, noise = trial, predicted, 2.0 * noise
+        bases = [problem]
+        if all(record.uniform for record in problem.records):
+            bases.append(problem.smoothed())
+        for base, factor in product(bases, _BANDS):
+            trial = base.without_noise(factor * base.path_noise)
+            if not (factor or trial.is_smoothed):
+                continue
+            end = self.descend(trial, theta, STEPS)
+            if end.converged[0] and end.cost[0] < lowest.cost[0]:
+                best, lowest = trial, end
         residuals = problem.split_residuals(problem.to_values(theta))
-        chance = significant_fall(least, problem.n_residuals, residuals)
-        if best is problem or 2.0 * (before - least) < chance:
+        chance = significant_fall(float(lowest.cost[0]), problem.n_residuals, residuals)
+        if not 2.0 * (plain.cost[0] - lowest.cost[0]) > chance:
             return problem, plain
-        end = self.descend(best, theta, STEPS)
-        if not end.converged[0] or not end.cost[0] < before:
-            return problem, plain
-        return best, end
+        return best, lowest
 
     def weighted(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate with residuals weighted by their spectrum, where they are slow.

@@ -1,8 +1,9 @@
 """Noise in records, and their motion within the drive's band.
 
 A law with memory counts every movement as travel. At rest a noisy displacement moves to and fro, so
-the friction computed from it dies away where the real one stays. Movements within a dead band of
-some standard deviations are therefore not counted, where the residuals confirm that they are noise.
+the friction computed from it dies away where the real one stays. The displacement is therefore
+smoothed, or movements within a dead band of some standard deviations are not counted, where the
+residuals confirm that they are noise.
 """
 
 from __future__ import annotations

@@ -102,7 +102,8 @@ class RecordProblem(RecordWaves):
 
     def for_records(self, records: Sequence[Record]) -> RecordProblem:
         """Return the problem of other records, corrected for this one's delay and noise."""
-        return self.like(records=records).delayed(self.delay).without_noise(self.displacement_noise)
+        others = self.like(records=records).smoothed(on=self.is_smoothed).delayed(self.delay)
+        return others.without_noise(self.displacement_noise)
 
     def with_whitening(self, whitening: FloatArray) -> RecordProblem:
         """Return the same problem with filtered residuals."""

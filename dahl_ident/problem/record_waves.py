@@ -99,6 +99,8 @@ class RecordWaves(Problem):
         """Time by which the motion lags the force in the records, s; taken out."""
         self.window = 1.0
         """Factor on the window in which displacements are differentiated."""
+        self.is_smoothed = False
+        """Whether displacements are smoothed in such a window, for the output "force"."""
         self.displacement_noise = 0.0
         """Standard deviation of the displacement, m, within which no movement counts."""
         self.paths: tuple[FloatArray, ...] | None = None
@@ -140,9 +142,16 @@ class RecordWaves(Problem):
 
         For the output "force"; see :func:`~.record_noise.travelled`.
         """
-        x = self._displacements if noise else []
+        x = [x for x, _, _ in self.motions] if noise else []
         paths = tuple(travelled(wave, noise, lead) for wave in x) or None
         return self.altered("latest", displacement_noise=noise, paths=paths)
+
+    def smoothed(self, *, on: bool = True) -> Self:
+        """Return the same problem, the displacements smoothed, or as measured.
+
+        Noise of a displacement is neither travel nor force where the motion is slower than it.
+        """
+        return self.altered("motions", "latest", is_smoothed=on)
 
     def delayed(self, delay: float) -> Self:
         """Return the same problem, the motion taken to lag the force by so many seconds."""
@@ -157,8 +166,9 @@ class RecordWaves(Problem):
     def noise_travel(self) -> float:
         """Travel that the displacement's noise would add, over the travel that counts."""
         measured = [np.abs(np.diff(np.asarray(r.displacement))).sum() for r in self.records]
-        counted = [np.abs(np.diff(path)).sum() for path in self.paths or ()]
-        return float(sum(measured) / sum(counted) - 1.0) if counted else 0.0
+        paths = self.paths or [x for x, _, _ in self.motions]
+        counted = [np.abs(np.diff(path)).sum() for path in paths]
+        return float(sum(measured) / sum(counted) - 1.0)
 
     @property
     def per_record(self) -> int:
@@ -251,19 +261,41 @@ class RecordWaves(Problem):
     def _motions_of(
         self, displacements: Sequence[FloatArray]
     ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
-        if all(e.rate_independent for e in self.model.elements):
-            return tuple((x, np.zeros(0), np.zeros(0)) for x in displacements)
-        from dahl_ident.engine import differentiated
+        slopes: tuple[FloatArray, FloatArray] = np.zeros(0), np.zeros(0)
+        rate_independent = all(e.rate_independent for e in self.model.elements)
+        if rate_independent and not self.is_smoothed:
+            return tuple((x, *slopes) for x in displacements)
+        from dahl_ident.engine import differentiated, smoothed
 
-        return tuple(
-            (x, *differentiated(x, 1.0 / record.sample_rate, self.window))
-            for x, record in zip(displacements, self.records, strict=True)
-        )
+        motions = []
+        for x, window, record in zip(displacements, self._windows, self.records, strict=True):
+            path = smoothed(x, window) if self.is_smoothed else x
+            if not rate_independent:
+                width = 2 * max(2, round(self.window * (window // 2))) + 1
+                slopes = differentiated(x, 1.0 / record.sample_rate, width)
+            motions.append((path, *slopes))
+        return tuple(motions)
 
     @cached_property
     def estimated_noise(self) -> float:
         """Standard deviation of the displacements' white noise, m; see `displacement_noise`."""
-        return float(np.median([noise_of(x) for x, _, _ in self.motions]))
+        return float(np.median([noise_of(x) for x in self._displacements]))
+
+    @property
+    def path_noise(self) -> float:
+        """Standard deviation of the noise that smoothing leaves, m."""
+        if not self.is_smoothed:
+            return self.estimated_noise
+        from dahl_ident.engine import noise_left
+
+        return self.estimated_noise * float(np.median([noise_left(w) for w in self._windows]))
+
+    @property
+    def _windows(self) -> list[int]:
+        """Samples in which the displacements are smoothed."""
+        from dahl_ident.engine import filter_window
+
+        return [filter_window(x) for x in self._displacements]
 
     def with_more_noise(self, noise: float, draw: int = 0) -> Self:
         """Return the same problem, white noise added to the displacements.
@@ -272,7 +304,7 @@ class RecordWaves(Problem):
         """
         rng = np.random.default_rng(draw)
         noisy = []
-        for x, _, _ in self.motions:
+        for x in self._displacements:
             reading = np.cumsum(np.diff(x, prepend=x[0]) != 0.0)
             noisy.append(x + noise * rng.standard_normal(x.size)[reading])
         return self.altered("latest", motions=self._motions_of(noisy))

@@ -138,7 +138,7 @@ def _table_problem(content: Mapping[str, Any]) -> TableProblem:
 
 
 def _describe_records(problem: RecordProblem) -> dict[str, Any]:
-    names = ("runs", *_OF_PROBLEM, "whitening", "delay", "displacement_noise")
+    names = ("runs", *_OF_PROBLEM, "whitening", "delay", "is_smoothed", "displacement_noise")
     records = []
     for record in problem.records:
         channels = {c: x for c in _CHANNELS if (x := getattr(record, c)) is not None}
@@ -155,7 +155,8 @@ def _record_problem(content: Mapping[str, Any]) -> RecordProblem:
     )
     problem.runs = tuple(content["runs"])
     problem = problem.with_whitening(_floats(content["whitening"]))
-    return problem.delayed(content["delay"]).without_noise(content["displacement_noise"])
+    problem = problem.smoothed(on=content["is_smoothed"]).delayed(content["delay"])
+    return problem.without_noise(content["displacement_noise"])
 
 
 _DESCRIBED: Mapping[str, Callable[[Any], dict[str, Any]]] = {
