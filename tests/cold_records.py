@@ -72,6 +72,23 @@ def fast(sigma: float, seed: int, n: int = 768) -> Case:
     return Case(record, truth, di.Dahl() + di.Mass() + di.Damper() + di.Spring())
 
 
+def accelerated(seed: int, n: int = 1024) -> Case:
+    """Return friction with an accelerometer, whose displacement drifts below the drive's band."""
+    rate, f_max, sigma, m, c, k = 1000.0, 1.0, 2e4, 0.5, 4.0, 2000.0
+    force, drive = multisine(n, rate, 1.0, 40.0, 3.0, seed)
+
+    def rates(t: float, y: FloatArray, u: float) -> list[float]:
+        v = y[1]
+        friction = sigma * v * (1.0 - np.sign(v) * y[2] / f_max)
+        return [v, (u - c * v - k * y[0] - y[2]) / m, friction]
+
+    x, v, friction = integrated(rates, np.zeros(3), drive, n, rate)
+    a = noisy((force - c * v - k * x - friction) / m, 1e-3, seed)
+    truth = di.Dahl(f_max, sigma) + di.Mass(m) + di.Damper(c) + di.Spring(k)
+    record = di.Record(np.arange(n) / rate, acceleration=a, force=force)
+    return Case(record, truth, di.Dahl() + di.Mass() + di.Damper() + di.Spring())
+
+
 def play(gap: float, seed: int) -> Case:
     """Return linear Dahl friction behind a gap of so many x_c, its displacement measured."""
     n, f_max, sigma = 2000, 0.1, 30.0

@@ -32,6 +32,13 @@ def test_friction_faster_than_the_sampling(sigma, seed, samples):
 
 
 @pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(i, marks=pytest.mark.long) for i in range(2, 8))]
+)
+def test_friction_with_an_accelerometer(seed):
+    assert_found(cold.accelerated(seed))
+
+
+@pytest.mark.parametrize(
     ("gap", "seed"),
     [
         (2.0, 1),

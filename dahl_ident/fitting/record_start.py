@@ -81,6 +81,7 @@ class _History(NamedTuple):
     velocity: FloatArray
     acceleration: FloatArray
     force: FloatArray
+    output: FloatArray
     time: FloatArray
 
 
@@ -128,7 +129,8 @@ class _Scan:
         energy = np.concatenate([[0.0], np.cumsum((v - v.mean()) ** 2)])
         start = int(np.argmax(energy[n:] - energy[:-n])) if n < x.size else 0
         part = slice(start, start + n)
-        return _History(x[part], v[part], a[part], force[part], record.time[part])
+        output = problem.measured[number]
+        return _History(x[part], v[part], a[part], force[part], output[part], record.time[part])
 
     def starts(self, count: int) -> FloatArray:
         """Return the best starts of the scan."""
@@ -213,7 +215,7 @@ class _Scan:
         try:
             return [
                 element.force_history(values, x, v, 0.0, acceleration=a, time=time)
-                for x, v, a, _, time in self.histories
+                for x, v, a, *_, time in self.histories
             ]
         except FitError:
             return []
@@ -299,8 +301,8 @@ class _Scan:
         return np.asarray(spectrum * self._weight(number))
 
     def _weight(self, number: int) -> FloatArray:
-        """Return a smooth receptance, zero outside the band, from forces to displacements."""
-        x, force = self.histories[number].displacement, self.histories[number].force
+        """Return a smooth gain, zero outside the band, from forces to the measured motion."""
+        x, force = self.histories[number].output, self.histories[number].force
         window = np.hanning(x.size)
         X, F = (np.abs(np.fft.rfft(window * (w - w.mean()))) for w in (x, force))
         if not F.any():  # a free decay: the forces balance by themselves
