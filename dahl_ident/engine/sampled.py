@@ -57,7 +57,7 @@ def noise_left(window: int) -> float:
     Examples
     --------
     >>> round(noise_left(5), 3), round(noise_left(101), 3)
-    (1.0, 0.186)
+    (1.0, 0.187)
     """
     from scipy.signal import savgol_coeffs  # slow to import, and rarely needed
 
