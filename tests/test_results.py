@@ -347,7 +347,7 @@ class TestStorage:
 
     def test_is_strict_json_with_a_schema(self, microslip):
         content = json.loads(microslip.to_json(), parse_constant=lambda name: pytest.fail(name))
-        assert (content["schema"], content["schema_version"]) == ("dahl_ident.fit_result", 4)
+        assert (content["schema"], content["schema_version"]) == ("dahl_ident.fit_result", 5)
         assert content["model"][0] == {
             "kind": "dahl",
             "f_max": "free",

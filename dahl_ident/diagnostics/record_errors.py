@@ -85,8 +85,9 @@ class RecordErrors(ErrorContributions):
         total = sum(parts.values())
         if np.isinf(total):
             return min(self.dof_of(name) for name, part in parts.items() if np.isinf(part))
-        spread = sum(2.0 * part**2 / self.dof_of(name) for name, part in parts.items())
-        return float(satterthwaite(np.asarray(total), np.asarray(spread)))
+        shares = {name: part / total for name, part in parts.items()} if total else {}
+        spread = sum(2.0 * share**2 / self.dof_of(name) for name, share in shares.items())
+        return float(satterthwaite(np.ones(()), np.asarray(spread)))
 
 
 def record_errors(

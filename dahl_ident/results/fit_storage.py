@@ -28,7 +28,7 @@ from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
 
 _SCHEMAS = {"table": "dahl_ident.fit_result", "records": "dahl_ident.record_fit"}
-VERSION = 4  # version of the layout; any other is refused
+VERSION = 5  # version of the layout; any other is refused
 _SAME = 1e-6  # relative difference above that between versions of numerical libraries
 
 _TEXTS = ("level", "run", "controlled", "harmonic")  # labels, words and counts
