@@ -355,7 +355,7 @@ class RecordAssessment(Assessment):
         """How residuals were weighted."""
         weighted = {"spectrum": "weighted by their spectrum", "white": "of constant variance"}
         return [
-            f"residuals {weighted[self.problem.noise]}; worth {self.errors.effective:.3g} "
+            f"residuals {weighted[self.problem.noise]}; worth {self.errors.effective:.0f} "
             f"independent samples of {self.problem.n_samples}"
         ]
 

@@ -181,9 +181,10 @@ def _residuals_of_record(
 
 
 def _output(fit: FittedModel, record: int) -> tuple[FloatArray, FloatArray, str]:
-    """Return the measured output, its residuals and the name of its channel."""
+    """Return the measured output, its residuals, and its label with the unit."""
     channel = "force" if fit.problem.output == "force" else fit.data[record].motion_channel
-    return fit.problem.measured[record], fit.residuals[record], channel
+    label = _labels(fit.data[record]).get(channel, channel)
+    return fit.problem.measured[record], fit.residuals[record], label
 
 
 def _displacement(record: Record) -> FloatArray:
