@@ -364,8 +364,8 @@ class TestStorage:
             di.FitResult.from_json("{")
         with pytest.raises(DataError, match="has the schema None"):
             di.FitResult.from_json("[]")
-        with pytest.raises(DataError, match="schema version 5; this version of dahl_ident reads 4"):
-            di.FitResult.from_json(json.dumps({**content, "schema_version": 5}))
+        with pytest.raises(DataError, match="schema version 6; this version of dahl_ident reads 5"):
+            di.FitResult.from_json(json.dumps({**content, "schema_version": 6}))
         del content["optimum"]["theta"]
         facts = {k: v for k, v in content.items() if k != "digest"}
         text = json.dumps(facts, sort_keys=True, separators=(",", ":"))

@@ -363,13 +363,17 @@ def _delay(fit: RecordAssessment) -> Iterator[Finding]:
 
 
 @_of_records
-def _notes(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield the size of the residuals, and what was done with the records."""
+def _size_of_residuals(fit: RecordAssessment) -> Iterator[Finding]:
     problem, goodness = fit.problem, fit.goodness
     size = {"rms": goodness.rms_misfit, "output": problem.output, "worst": goodness.worst}
     yield described("record_residuals", **size)
     if problem.whitening.size > 1:
         yield described("slow_residuals", rms=goodness.rms_in_band)
+
+
+@_of_records
+def _treatment_of_noise(fit: RecordAssessment) -> Iterator[Finding]:
+    problem = fit.problem
     if problem.displacement_noise or problem.is_smoothed:
         yield described(
             "displacement_noise",
@@ -445,7 +449,8 @@ CHECKS: tuple[_Check, ...] = (
     _weak_elements,
     _steady,
     _delay,
-    _notes,
+    _size_of_residuals,
     reading,
+    _treatment_of_noise,
     assumptions,
 )

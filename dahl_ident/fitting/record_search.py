@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 
@@ -239,8 +238,9 @@ class RecordSearch:
 
         Noise that counts as travel changes the friction force where the device rests or is slow.
         The displacement is smoothed, or movements within a dead band are not counted, or both,
-        whichever leaves the smallest residuals. The band is of one, two or four times the estimated
-        noise: correlated noise shows less in differences, but a wider band would be play.
+        whichever leaves the smallest residuals. The band is doubled as long as they become smaller,
+        up to four times the estimated noise: correlated noise shows less in differences, but a
+        wider band would be play.
         """
         theta, best, lowest = plain.theta[0], problem, plain
         if not plain.converged[0] or not problem.with_memory or problem.estimated_noise == 0.0:
@@ -248,13 +248,16 @@ class RecordSearch:
         bases = [problem]
         if all(record.uniform for record in problem.records):
             bases.append(problem.smoothed())
-        for base, factor in product(bases, _BANDS):
-            trial = base.without_noise(factor * base.path_noise)
-            if not (factor or trial.is_smoothed):
-                continue
-            end = self.descend(trial, theta, STEPS)
-            if end.converged[0] and end.cost[0] < lowest.cost[0]:
-                best, lowest = trial, end
+        for base in bases:
+            least = np.inf if base.is_smoothed else float(plain.cost[0])
+            for factor in _BANDS if base.is_smoothed else _BANDS[1:]:
+                trial = base.without_noise(factor * base.path_noise)
+                end = self.descend(trial, theta, STEPS)
+                if not end.converged[0] or not end.cost[0] < least:
+                    break
+                least = float(end.cost[0])
+                if least < lowest.cost[0]:
+                    best, lowest = trial, end
         residuals = problem.split_residuals(problem.to_values(theta))
         chance = significant_fall(float(lowest.cost[0]), problem.n_residuals, residuals)
         if not 2.0 * (plain.cost[0] - lowest.cost[0]) > chance:
