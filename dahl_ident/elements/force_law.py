@@ -61,7 +61,6 @@ class ForceLaw(ABC):
     softens : bool
         True: Re N falls with the amplitude, whatever the values.
     holds_at_rest : bool
-
         True: holding a constant displacement may take a force.
     starts : tuple of (str, str, str)
         Name, unit and meaning of each unknown from which the states follow at the first sample.

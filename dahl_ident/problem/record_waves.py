@@ -155,7 +155,7 @@ class RecordWaves(Problem):
 
     def delayed(self, delay: float) -> Self:
         """Return the same problem, the motion taken to lag the force by so many seconds."""
-        delayed = self.altered("motions", "drives", "latest", delay=delay)
+        delayed = self.altered("motions", "drives", "latest", "_windows", delay=delay)
         return delayed.without_noise(self.displacement_noise)
 
     def differentiated_in(self, window: float) -> Self:
@@ -290,7 +290,7 @@ class RecordWaves(Problem):
 
         return self.estimated_noise * float(np.median([noise_left(w) for w in self._windows]))
 
-    @property
+    @cached_property
     def _windows(self) -> list[int]:
         """Samples in which the displacements are smoothed."""
         from dahl_ident.engine import filter_window
