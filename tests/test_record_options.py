@@ -169,6 +169,12 @@ def test_options_of_the_other_kind_are_refused(data, option):
         di.fit(data, MODEL, **option)
 
 
+def test_parts_of_a_table_are_refused_like_other_options():
+    fit = di.fit(di.load_dataset("noisy"), MODEL)
+    with pytest.raises(ValidationError, match="parts is given with a table: its tests are left"):
+        fit.hold_out(3)
+
+
 def test_an_unknown_excitation_is_refused_at_once():
     with pytest.raises(ValidationError, match="excitation is 'foo'; expected one of force, base"):
         di.fit(record(TRUE), MODEL + di.Mass(), excitation="foo")  # type: ignore[arg-type]

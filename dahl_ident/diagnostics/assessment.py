@@ -349,8 +349,6 @@ class TableAssessment(Assessment):
         return None if errors is None else cross_validation(errors.left_out)
 
     def _hold_out(self, parts: int | None) -> CrossValidation:
-        if parts is not None:
-            raise ValidationError("tests of a table are left out one at a time; leave parts out")
         check = self.cross_validation
         if check is None:
             raise FitError("the table has too few tests to leave one out; measure more levels")

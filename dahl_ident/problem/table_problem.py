@@ -78,6 +78,7 @@ class TableProblem(Problem):
     refused_options: ClassVar[Mapping[str, str]] = {
         "output": "it follows from the quantity that was controlled in each row",
         "excitation": "rows are responses to a force",
+        "parts": "its tests are left out one at a time",
     }
     output_in_words = "the fundamental"
     _orbits: dict[int, FloatArray]

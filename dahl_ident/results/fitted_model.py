@@ -35,6 +35,7 @@ from dahl_ident.diagnostics.verdicts import Identifiability, Verdict
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum
+from dahl_ident.problem import refuse_options
 from dahl_ident.results.result import Parameters, Result, part
 from dahl_ident.units import Quantity
 
@@ -388,7 +389,10 @@ class FittedModel(Result):
             If a part is too short to be fitted.
         FitError
             If nothing is left to fit, or the fit had constraints.
+        ValidationError
+            If parts are given with a table.
         """
+        refuse_options(type(self.problem), {"parts": parts}, FittedModel.hold_out)
         return self.assessment.hold_out(parts)
 
     def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
