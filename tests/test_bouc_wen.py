@@ -153,6 +153,40 @@ def way(force, rate, n):
     return force * mpmath.hyp2f1(1.0, 1.0 / n, 1.0 + 1.0 / n, np.sign(rate) * u**n)
 
 
+def force_along(x, sigma, q, p, n, steps=100):
+    """Return the force along displacements, from rest, by small steps of Runge and Kutta."""
+
+    def slope(force, direction):
+        rate = q if direction * force >= 0.0 else -p
+        return sigma * (1.0 - np.sign(rate) * abs(rate * force / sigma) ** n)
+
+    forces = [0.0]
+    for moved in np.diff(x):
+        h, d, force = moved / steps, np.sign(moved), forces[-1]
+        for _ in range(steps):
+            k1 = slope(force, d)
+            k2 = slope(force + 0.5 * h * k1, d)
+            k3 = slope(force + 0.5 * h * k2, d)
+            k4 = slope(force + h * k3, d)
+            force += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        forces.append(force)
+    return np.array(forces)
+
+
+def test_a_record_of_a_law_with_an_exponent_below_1_is_identified():
+    """At 0 N the derivatives of such a law are infinite."""
+    true = {"sigma": 30.0, "q": 300.0, "p": 200.0, "exponent": 0.6}
+    t = np.arange(0.0, 4.0, 0.02)
+    x = 5e-3 * np.sin(np.pi * t) * (1.0 - 0.8 * np.exp(-t))
+    noise = np.random.default_rng(1).normal(scale=5e-4, size=t.size)
+    force = force_along(x, *true.values()) + noise
+    fit = di.fit(di.Record(t, displacement=x, force=force), BoucWen(exponent=None))
+    assert fit.trusted
+    for name, value in true.items():
+        assert abs(fit.params[name].value - value) < 3.5 * fit.params[name].stderr, name
+    assert fit.params["exponent"].stderr < 0.02
+
+
 class Root(di.Friction):
     """Bouc-Wen with q = p and the exponent 0.5, as users write it."""
 

@@ -215,6 +215,13 @@ def test_the_density_of_a_record_is_that_of_blocks_left_out():
         assert density == pytest.approx(normal.logpdf(y[rows]), rel=1e-6)
 
 
+def test_a_damper_is_added_to_a_law_with_an_exponent():
+    fit = di.fit(di.load_dataset("alpha_2"), di.BoucWen(30.0, 300.0, exponent=0.6), throw=False)
+    comparison = di.compare_models(fit)
+    assert not comparison.failed
+    assert "power damper added" in [model.name for model in comparison.models]
+
+
 def test_a_power_damper_is_found_where_dahl_alone_slips_at_once():
     """Friction small against a damper of exponent 0.47, as of magneto-rheological dampers."""
     rng = np.random.default_rng(2)

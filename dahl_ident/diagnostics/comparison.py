@@ -528,7 +528,7 @@ def _candidates(
     if several:  # at one frequency a mass is a spring
         added += [Mass(), Damper()]
     if several or optimum.loss == "linear":  # outliers at large amplitudes look like a damper
-        added.append(PowerDamper())
+        added.append(PowerDamper(name="added"))  # a law may have an exponent too
     for element in added:
         if all(e.kind != element.kind for e in model.elements):
             yield f"{element.kind.replace('_', ' ')} added", span, (model, element)

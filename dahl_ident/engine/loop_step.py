@@ -24,7 +24,7 @@ from dahl_ident.engine.collocation import (
     VALUE_BEFORE,
 )
 from dahl_ident.engine.events import DECADE, FADED, LEFT
-from dahl_ident.engine.radau import NEAR, SIDED, SOLVED, compiled, eliminate
+from dahl_ident.engine.radau import NEAR, SIDED, SOLVED, compiled, eliminate, remove_pole
 
 _NEWTON = 15  # iterations of the stages
 _FLOOR = 1e-6  # of the largest force: smaller local forces are no scale for errors
@@ -102,6 +102,7 @@ def solve_stages(f, psi, h, F, at):
             for e in range(at.k):
                 at.functions[i, e] = w[o + 4 + e]
                 at.turns[i, e] = w[o + at.m + 3 * (4 + e) + 2]
+        remove_pole(at.slopes, 0, 1)
         for i in range(STAGES):
             value = -at.stages[i]
             for j in range(STAGES):
@@ -327,19 +328,20 @@ def last_step(f, h, F, columns, turned, at):
         by_output = by_rate + 1 + at.P
         at.slopes[j], at.last[j], at.output[j] = w[rates + 2] / omega, w[outputs + 2], w[o + 3]
         for z in range(columns):
-            value, explicit = at.slopes[j] * at.S[z], 0.0
+            value, explicit = 0.0, 0.0
             if z == 1:
-                value += (w[rates] * w[1] + w[rates + 1] * w[2]) / (at.numbers[0] * omega)
+                value = (w[rates] * w[1] + w[rates + 1] * w[2]) / (at.numbers[0] * omega)
                 explicit = (w[outputs] * w[1] + w[outputs + 1] * w[2]) / at.numbers[0]
             elif z > 1 and at.chosen[z - 2] < at.P:
-                value += w[by_rate + at.chosen[z - 2]] / omega
+                value = w[by_rate + at.chosen[z - 2]] / omega
                 explicit = w[by_output + at.chosen[z - 2]]
             at.changes[j, z], at.explicit[j, z] = value, explicit
+    remove_pole(at.slopes, 0, 1)
     for i in range(STAGES):
         for z in range(columns):
             value = 0.0
             for j in range(STAGES):
-                value += MATRIX[i, j] * at.changes[j, z]
+                value += MATRIX[i, j] * (at.changes[j, z] + at.slopes[j] * at.S[z])
             at.columns[i, z] = h * value
         for j in range(STAGES):
             at.matrix[i, j] = -h * MATRIX[i, j] * at.slopes[j]

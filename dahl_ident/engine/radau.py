@@ -46,6 +46,7 @@ _HARDLY = 1e-6  # of the displacement: a smaller follower is no scale for errors
 _PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is not a pivot
 NEAR = 1e-10  # of a switching function's largest value: counts as zero
 SIDED = 0.1  # largest relative change of a switching function whose sign is certain
+_POLE = 3.0  # a slope at the end of a step, over the largest before, that counts as infinite
 
 FUNCTION = types.FunctionType(types.void(types.CPointer(float64)))
 NUMBERS, VECTOR, TABLE = int64[::1], float64[::1], float64[:, ::1]
@@ -394,6 +395,20 @@ def read_stage(f, solved, followers, level, i, y, w, at):
 
 
 @compiled
+def remove_pole(slopes, first, between):
+    """Replace a slope at the last stage by that before if it is infinite there.
+
+    A rate with a power of abs(force) below 1 has such a slope at zero force, where the step ends.
+    Its integral is finite.
+    """
+    last, largest = first + (STAGES - 1) * between, 0.0
+    for i in range(first, last, between):
+        largest = max(largest, abs(slopes[i]))
+    if abs(slopes[last]) > _POLE * largest:
+        slopes[last] = slopes[last - between]
+
+
+@compiled
 def fill_matrix(R, h, w, at, matrix):
     """Fill the matrix of the stages' linear equations for R solved states."""
     for i in range(STAGES):
@@ -522,6 +537,11 @@ def sensitivities(f, solved, followers, signal, t, h, y, S, first, chosen, w, at
     m, d = n + 1 + at.k, at.changes
     for i in range(STAGES):
         read_stage(f, solved, followers, 2, i, y, w, at)
+    for a in range(R):
+        for b in range(n):
+            remove_pole(w, at.state_slopes + solved[a] * n + b, m * n)
+        for b in range(R):
+            remove_pole(w, at.solved_slopes + a * R + b, R * R)
     w[d : d + STAGES * n * q] = 0.0
     for i in range(STAGES):  # first the terms that do not depend on the solved states
         row, phase = d + i * n * q, signal.omega * (t + NODES[i] * h)
