@@ -48,6 +48,7 @@ F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
 SEED = 2006
 DATA_SETS, BOOTSTRAPPED, REPLICATES = 2000, 200, 999
+DRIVEN = (600, 12)  # data sets and bootstrapped ones of a plant, whose fits take a second each
 SMALL = (32, 8, 199)
 METHODS = ("wald", "profile", "bootstrap")
 VERDICTS_RIGHT = 0.99
@@ -64,6 +65,7 @@ class Scenario:
     problem: TableProblem
     truth: FloatArray
     noise: float
+    most: tuple[int, int] = (DATA_SETS, BOOTSTRAPPED)
 
     @property
     def theta(self) -> FloatArray:
@@ -110,7 +112,8 @@ def _plant(name: str, noise: float) -> Scenario:
         quantity="receptance",
     )
     model = Dahl() + Mass() + Damper() + Spring()
-    return Scenario(name, TableProblem(data, model, noise="relative"), np.array(truth), noise)
+    problem = TableProblem(data, model, noise="relative")
+    return Scenario(name, problem, np.array(truth), noise, DRIVEN)
 
 
 @dataclass
@@ -282,8 +285,9 @@ def run(
     workers = processes or os.cpu_count() or 1
     for index in chosen or range(len(everything)):
         scenario = everything[index]
-        edges = np.linspace(0, count, 4 * workers + 1).astype(int)
-        shares = np.diff(np.linspace(0, bootstrapped, 4 * workers + 1).astype(int))
+        sets, resampled = np.minimum((count, bootstrapped), scenario.most)
+        edges = np.linspace(0, sets, 4 * workers + 1).astype(int)
+        shares = np.diff(np.linspace(0, resampled, 4 * workers + 1).astype(int))
         jobs = [
             (index, int(a), int(b - a), int(share), replicates)
             for a, b, share in zip(edges[:-1], edges[1:], shares, strict=True)
