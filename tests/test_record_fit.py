@@ -1,6 +1,7 @@
 """Fits to records of any motion: recovery, error bars, verdicts, prediction, storage, refusals."""
 
 import copy
+import dataclasses
 import json
 import os
 import pickle
@@ -372,6 +373,35 @@ def test_parts_that_are_left_out_are_predicted():
 def test_a_wrong_model_is_not_trusted():
     fit = di.fit(recorded(di.Spring(10.0) + DAHL, "random", 800, 1e-4), di.Dahl(), throw=False)
     assert not fit.trusted
+
+
+def test_clipped_samples_are_named_and_not_trusted():
+    record = recorded(DAHL, "multisine", 2000, 1e-4)
+    assert "clipped" not in di.fit(record, di.Dahl()).verdict
+    held = np.clip(record.force, -0.07, 0.07)
+    verdict = di.fit(dataclasses.replace(record, force=held), di.Dahl()).verdict
+    share = np.mean(np.abs(record.force) > 0.07)
+    assert verdict.startswith(
+        f"Not described. The force is clipped in {100.0 * share:.0f} % of the samples"
+    )
+
+
+def test_a_force_that_slips_without_noise_is_not_called_clipped():
+    slip = di.MaxwellSlip([1e-3], [30.0])
+    fit = di.fit(recorded(slip, "multisine", 2000, 0.0), di.Dahl(), throw=False)
+    assert not any(finding.code == "clipped" for finding in fit.judgement.findings)
+
+
+@pytest.mark.parametrize("channel", ["force", "drive"])
+def test_a_reversed_force_is_named_as_the_cause(channel):
+    record = recorded(DAHL, "multisine", 2000, 1e-3)
+    reversed_ = {channel: -record.force, "drive_unit": "N"}
+    upside_down = di.Record(record.time, displacement=record.displacement, **reversed_)
+    verdict = di.fit(upside_down, di.Dahl(), throw=False).verdict
+    noise = 100.0 * 1e-3 / np.std(record.force)
+    assert verdict.startswith("Not described. With the force negated the misfit falls from 99 % to")
+    assert f"to {noise:.2g} % rms: check that force and displacement are positive in the" in verdict
+    assert "Nothing is determined" not in verdict
 
 
 def test_stored_and_read_again(tmp_path):

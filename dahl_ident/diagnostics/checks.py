@@ -37,6 +37,7 @@ from dahl_ident.diagnostics.physics import (
 )
 from dahl_ident.diagnostics.record_assessment import RecordAssessment
 from dahl_ident.diagnostics.record_misfit import REMEDY
+from dahl_ident.extraction.segment_quality import clipped_share, sensor_step, white_noise
 from dahl_ident.fitting.losses import LOSSES
 from dahl_ident.units import si_unit
 
@@ -134,6 +135,9 @@ def _reservations(fit: Assessed) -> list[Finding]:
 @_of_records
 def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield whether the model describes the records, then the reservations about the fit."""
+    if fit.goodness.sign:
+        yield described("sign", _NOT_DESCRIBED, convention=fit.goodness.sign)
+        return
     problem, converged = fit.problem, fit.optimum.converged
     far = fit.goodness.rms_in_band > (_FAIRLY if fit.exceeds_noise else _TOO_LARGE)
     if far:
@@ -363,6 +367,22 @@ def _delay(fit: RecordAssessment) -> Iterator[Finding]:
 
 
 @_of_records
+def _clipped(fit: RecordAssessment) -> Iterator[Finding]:
+    """Yield the channels of which some samples are clipped."""
+    shares = dict[str, float]()
+    for record in fit.problem.records:
+        force = "drive" if record.force is None else "force"
+        waves = {record.motion_channel: record.motion_samples, force: record.force_samples}
+        for channel, samples in waves.items():
+            share = clipped_share(samples, sensor_step(samples), white_noise(samples))
+            weight = len(record) / fit.problem.n_samples
+            shares[channel] = shares.get(channel, 0.0) + weight * share
+    for channel, share in shares.items():
+        if share:
+            yield described("clipped", _NOT_DESCRIBED, channel=channel, share=share)
+
+
+@_of_records
 def _size_of_residuals(fit: RecordAssessment) -> Iterator[Finding]:
     problem, goodness = fit.problem, fit.goodness
     size = {"rms": goodness.rms_misfit, "output": problem.output, "worst": goodness.worst}
@@ -448,6 +468,7 @@ CHECKS: tuple[_Check, ...] = (
     _misfit_of_records,
     _weak_elements,
     _steady,
+    _clipped,
     _delay,
     _size_of_residuals,
     reading,

@@ -24,7 +24,8 @@ from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.fitting.global_start import global_starts
-from dahl_ident.problem import TableProblem
+from dahl_ident.problem import RecordProblem, TableProblem
+from dahl_ident.problem.record_noise import in_band
 from dahl_ident.units import percent
 
 _CHANCE = 0.01  # false-alarm rate of the worst of all points
@@ -225,10 +226,45 @@ def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimu
     after = misfit_of(solve(problem, loss=optimum.loss))
     if not after * EXPLAINS < before:
         return ""
-    return (
-        f"With the response {change.name} the misfit falls from {percent(before)} to "
-        f"{percent(after)} rms: {change.check}"
-    )
+    return _with_changed_sign(f"the response {change.name}", before, after, change.check)
+
+
+def _with_changed_sign(what: str, before: float, after: float, check: str) -> str:
+    misfits = f"from {percent(before)} to {percent(after)} rms"
+    return f"With {what} the misfit falls {misfits}: {check}"
+
+
+def force_convention(optimum: Optimum, before: float) -> str:
+    """Return in words that the force of records has the wrong sign; "" if that is not the misfit.
+
+    Only where the force takes energy out of the mechanism the opposite sign is fitted.
+    """
+    problem: RecordProblem = optimum.problem
+    if problem.excitation == "base" or _work(problem) >= 0.0:
+        return ""
+    force = [(r, "drive" if r.force is None else "force") for r in problem.records]
+    records = [replace(r, **{name: -getattr(r, name)}) for r, name in force]
+    try:
+        changed = solve(problem.like(records=records), loss=optimum.loss)
+    except DahlIdentError:
+        return ""
+    residuals = np.concatenate(changed.problem.split_residuals(changed.values))
+    after = float(np.sqrt(np.mean(residuals**2))) / problem.output_std
+    if not after * EXPLAINS < before:
+        return ""
+    return _with_changed_sign("the force negated", before, after, _SIGN)
+
+
+def _work(problem: RecordProblem) -> float:
+    """Return the work of the force on the motion of all records, J."""
+    work = 0.0
+    for record in problem.records:
+        x = record.displacement
+        if x is None:
+            x = in_band(record, record.motion_samples)[0]
+        force = record.force_samples - record.force_samples.mean()
+        work += float(np.trapezoid(force, x))
+    return work
 
 
 def refitted_without(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:

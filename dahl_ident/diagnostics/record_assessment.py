@@ -27,6 +27,7 @@ from dahl_ident.diagnostics.contributions import ALONG_MOTION, MODEL_ERROR, NOIS
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
+from dahl_ident.diagnostics.misfit_explanations import force_convention
 from dahl_ident.diagnostics.record_errors import (
     RecordErrors,
     errors_on_constraints,
@@ -51,6 +52,7 @@ from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.units import percent, shown_unit
 
 _POSITIVE = 1e-100  # smallest positive value, or misfit over the response
+_LARGE = 0.2  # rms misfit from which the sign of the force is doubted
 _SEGMENTS = 50  # of a record: the worst one is 2 % of it
 _UNKNOWN = 1e24  # variance of a logarithm that the records do not determine
 
@@ -296,8 +298,11 @@ class RecordAssessment(Assessment):
 
     @cached_property
     def goodness(self) -> RecordGoodness:
-        """Statistics of the residuals."""
-        return record_goodness(self.problem, self.residuals)
+        """Statistics of the residuals, and whether the force's sign explains them."""
+        goodness = record_goodness(self.problem, self.residuals)
+        if goodness.rms_in_band < _LARGE:
+            return goodness
+        return replace(goodness, sign=force_convention(self.optimum, goodness.rms_misfit))
 
     @property
     def exceeds_noise(self) -> bool:

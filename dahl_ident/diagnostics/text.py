@@ -344,6 +344,8 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "{wanted}.",
     "few_effective_samples": "The residuals are so slow that they are worth {effective:.0f} "
     "samples, few for {unknowns} unknowns: record for longer.",
+    "clipped": "The {channel} is clipped in {share:percent} of the samples: it repeats an extreme "
+    "value exactly, in spite of its noise. Measure again with a larger range.",
     "delay": lambda delay, samples, doubtful: (
         f"The motion {'lags' if delay > 0.0 else 'leads'} the force by {abs(samples):.2g} samples "
         f"({abs(delay):.2g} s): taken out."

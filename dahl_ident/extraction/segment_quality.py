@@ -15,9 +15,9 @@ If r is not a whole number, the alias separates from the harmonic as the number 
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import fdtri
+from scipy.special import comb, fdtri
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray, IntArray
+from dahl_ident.arrays import NORMAL_MEDIAN, TINY, ComplexArray, FloatArray, IntArray
 from dahl_ident.extraction.cycles import scattered
 from dahl_ident.extraction.sine_fit import HARMONICS, Segment, SineFit
 
@@ -31,6 +31,11 @@ _SAME_VALUE = 1e-9  # fraction of the range; values closer together differ only 
 _RAIL_RUN = 5  # samples in a row at an extreme value that may be clipped
 _CORNER = 3  # samples within which a clipped waveform leaves the rail
 _DEPARTURE = 1e-4  # fraction of the span by which it is then away from the rail
+_SEEN, _VISIBLE = 0.75, 1e-6  # steps, and fraction of the span: noise that constant values lack
+_ORDERS = 3, 6  # of differences, whose sizes agree for white noise, but not for a motion
+_AGREE = 1.5  # largest ratio of these sizes
+_NORMAL_QUARTILE = 0.3186  # of a normal variable's absolute value, in standard deviations
+_FEWEST_DIFFERENCES = 100  # by which the noise is judged
 EVEN = (2, 4, 6, 8)  # the lowest harmonics, which are the largest
 BY_CHANCE = 1e-4  # largest fraction of symmetric points that are called asymmetric
 _LEAST_HARMONIC = 1e-3  # fraction of the fundamental; smaller even harmonics do not matter
@@ -72,16 +77,34 @@ def quantisation_errors(
     return np.asarray(np.where(rounded, error, 0.0))
 
 
-def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:
+def white_noise(samples: FloatArray) -> float:
+    """Return the standard deviation of white noise, extreme samples left out; 0 if it is not seen.
+
+    Median and quartile of differences of two orders have to agree on it: those of a waveform with
+    kinks, or with coarse samples, do not.
+    """
+    used = (samples > samples.min()) & (samples < samples.max())
+    sizes: list[float] = []
+    for order in _ORDERS:
+        whole = np.convolve(used, np.ones(order + 1), "valid") > order + 0.5
+        steps = np.abs(np.diff(samples, order))[whole] / np.sqrt(comb(2 * order, order))
+        if steps.size < _FEWEST_DIFFERENCES:
+            return 0.0
+        sizes += (np.quantile(steps, [0.5, 0.25]) / [NORMAL_MEDIAN, _NORMAL_QUARTILE]).tolist()
+    return min(sizes) if max(sizes) < _AGREE * min(sizes) else 0.0
+
+
+def clipped_share(samples: FloatArray, step: float, noise: float, crest: float = np.inf) -> float:
     """Return the fraction of samples in runs of constant extreme values that end in a corner.
 
-    If the noise is less than the sensor's step, the `crest` of a sine, so many samples, is constant
-    as well.
+    A force in slip is as constant without noise, or where the sensor's step hides the noise. Then
+    only the `crest` of a sine, so many samples, is known to be shorter than such a run.
     """
     highest, lowest = float(samples.max()), float(samples.min())
     span = highest - lowest
     tolerance = max(0.5 * step, _SAME_VALUE * span)
-    longest = max(_RAIL_RUN, 1.5 * crest) if noise < 0.5 * step else _RAIL_RUN
+    seen = noise > max(_SEEN * step, _VISIBLE * span)
+    longest = _RAIL_RUN if seen else max(_RAIL_RUN, 1.5 * crest)
     stuck = 0
     for rail, at_rail in (
         (highest, samples > highest - tolerance),
