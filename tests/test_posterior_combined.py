@@ -12,6 +12,7 @@ from dahl_ident.diagnostics.contributions import NOISE
 from dahl_ident.diagnostics.error_model import row_errors
 from dahl_ident.errors import SamplingError, ValidationError
 from tests.bayes_cases import friction_table
+from tests.friction_tables import relative_noise
 
 LINEAR = di.Dahl(alpha=1.0)
 Q = (0.02275, 0.97725)
@@ -69,6 +70,31 @@ def test_intervals_are_those_of_the_budget_where_all_is_linear():
     assert chain.names == grid.names
     share = np.mean((chain.values[:, 0] > low) & (chain.values[:, 0] < high))
     assert share == pytest.approx(0.9545, abs=0.03)
+
+
+def driven_table(seed):
+    f, drive = np.repeat([6.0, 12.0, 18.0, 25.0], 3), np.tile([0.05, 0.15, 0.4], 4)
+    plant = di.Dahl(f_max=0.1, sigma=300.0) + di.Mass(0.02) + di.Damper(0.05)
+    R = di.response(plant, f, drive).receptance * relative_noise(12, 0.02, seed)
+    return di.FrequencyResponse(f, R, drive=drive, controlled="force", quantity="receptance")
+
+
+@pytest.mark.parametrize(
+    ("data", "model", "name"),
+    [
+        (di.load_dataset("noisy"), di.Dahl(), "f_max"),
+        (driven_table(14), LINEAR + di.Mass(0.02) + di.Damper(0.05), "sigma"),
+    ],
+)
+def test_the_jackknife_over_tests_is_counted(data, model, name):
+    """Where it is the largest source, the interval is as wide as that of the budget."""
+    fit = di.fit(data, model)
+    budget = fit.budget()[name]
+    assert budget.rows[0].source == "jackknife over tests"
+    grid = di.posterior(fit, method="grid", tolerance=1e-2)
+    low, high = grid.quantile(name, Q)
+    assert high - low == pytest.approx(2.0 * budget.U, rel=0.08)
+    assert "Counted: noise; jackknife over tests" in grid.verdict
 
 
 @pytest.mark.long

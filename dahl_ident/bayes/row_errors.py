@@ -13,7 +13,9 @@ nu/chi^2_nu. The likelihood is the mean of the likelihoods with each lambda, eac
 integral over the parameters (Laplace's).
 
 Where a parameter differs from run to run, V_c includes the effect on the residuals to first order,
-so the residuals are linear in that parameter, which is the mean over runs.
+so the residuals are linear in that parameter, which is the mean over runs. What leaving out tests
+adds to the covariance of the estimate, C, is J C J' in V_c, with J the derivatives of y: it adds C
+to the covariance of the parameters and does not move them.
 """
 
 from __future__ import annotations

@@ -477,9 +477,11 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     """Return errors that rows share, for a posterior's likelihood; None if rows are independent."""
     problem, estimate, m = errors.problem, errors.estimate, errors.problem.n_residuals
     as_stated = not estimate.problem.has_misfit and (errors.noises < 1.0 + _AS_STATED).all()
-    if not errors.sources and (as_stated or not problem.scale_known):
+    by_tests = errors.contributions.get(TESTS)
+    if not errors.sources and by_tests is None and (as_stated or not problem.scale_known):
         return None
-    counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))
+    names = [NOISE, *(s.name for s in errors.sources), *[TESTS] * (by_tests is not None)]
+    counted = tuple(dict.fromkeys(names))
     # residuals in units of the noise of each single row, or of an unknown scale
     unit, size = (1.0, 1.0) if problem.scale_known else (errors.noises[0], estimate.scale)
     root = np.sqrt(unit * errors.state.weights[errors.state.model.group[:m]])
@@ -498,6 +500,10 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     for source, part in zip(errors.sources, columns, strict=True):
         target = noise if source.name == NOISE else shared
         target += part @ part.T / unit
+    if by_tests is not None:  # widens the posterior by this covariance, and moves nothing
+        moved = root[:, None] * estimate.jacobian[:m]
+        moved = moved if basis is None else basis.T @ moved
+        shared += moved @ by_tests @ moved.T / unit
     L = np.linalg.cholesky(noise)
     # shared over noise is diagonal in the coordinates W y; see RowErrors
     ratios, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, shared).T))
@@ -530,7 +536,7 @@ def _dof_and_share(errors: ErrorModel) -> tuple[float, float]:
 
     Both are those of the parameter for which that fraction is largest.
     """
-    names = {s.name for s in errors.sources if s.name != NOISE}
+    names = {TESTS, *(s.name for s in errors.sources)} & set(errors.contributions) - {NOISE}
     shared = sum((np.diagonal(errors.contributions[n]) for n in names), np.zeros(len(errors.names)))
     shares = shared / np.maximum(np.diagonal(errors.covariance), TINY)
     shares[[errors.names.index(name) for name in errors.assumed]] = 0.0
