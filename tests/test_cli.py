@@ -567,6 +567,14 @@ def test_an_input_is_never_written_over(run, option):
         (("fit", "-", "--delay", "soon"), "delay is 'soon'; expected a number"),
         (("fit", "-", "--force-gain", "nrm(1,2)"), "expected a distribution of scipy.stats"),
         (("fit", "-", "--force-gain", "norm(1,a)"), "which are not arguments of norm"),
+        (
+            ("fit", "-", "--force-gain", "norm(1)"),
+            "leaves out the scale; expected norm(loc, scale)",
+        ),
+        (
+            ("sample", "-", "--prior", "sigma=lognorm(0.1)"),
+            "leaves out the scale; expected lognorm(s, loc, scale)",
+        ),
         (("fit", "-", "--force-gain", "norm(1,0)"), "has no finite mean or no width"),
     ],
 )

@@ -123,6 +123,12 @@ def distribution(name: str, text: str) -> Any:
         raise ValidationError(
             f"{name} is {text!r}, which are not arguments of {call[1]}: {exc}"
         ) from exc
+    shapes = [*(kind.shapes or "").replace(",", " ").split(), "loc", "scale"]
+    if len(positional) < len(shapes) and "scale" not in by_name:  # scipy would take 1 in SI units
+        raise ValidationError(
+            f"{name} is {text!r}, which leaves out the scale; expected "
+            f"{call[1]}({', '.join(shapes)}), such as norm(1,0.005)"
+        )
     if not (math.isfinite(frozen.mean()) and frozen.std() > 0.0):
         raise ValidationError(f"{name} is {text!r}, which has no finite mean or no width")
     return frozen

@@ -182,7 +182,7 @@ class Goodness:
     # root mean square of abs(measured - fitted)/abs(measured), of fundamentals where there are any;
     # of records, of the residuals over that of the measured output's variation
     rms_misfit: float
-    warnings: tuple[str, ...] = ()  # what is physically impossible or unsafe
+    warnings: tuple[str, ...] = ()  # what is impossible or unsafe, and no finding tells
     flagged: tuple[str, ...] = ()  # rows that the extraction flagged, with the reason
     chi_square: ChiSquare | None = None  # where the noise's scale is known
     # estimated noise over the size of the response; None where the noise's scale is known
@@ -389,7 +389,7 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
         return tested  # Ipopt may have had constraints, which other searches would not keep
     sign = sign_convention(optimum, tested.rms_misfit, _misfit_if_described)
     if sign:
-        return replace(tested, sign=sign, warnings=(*tested.warnings, sign))
+        return replace(tested, sign=sign)
     tested = _without_suspicious(optimum, tested)
     differ = tested.runs_differ or any(group.p_value < tested.level for group in tested.groups)
     if differ or not tested.objections:

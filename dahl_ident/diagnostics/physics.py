@@ -138,7 +138,7 @@ def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
 
 def physical_warnings(optimum: Optimum) -> Iterator[str]:
     """Yield a sentence for each property of an estimate that is impossible or unsafe."""
-    yield from negative_parameters(optimum)
+    yield from negative_parameters(optimum, estimated=False)  # findings tell the estimated ones
     if optimum.status is Status.AT_BOUND:
         at_bounds = values_at_bounds(optimum.problem, optimum.theta, optimum.values)
         yield at_bounds or optimum.message  # that of constraints states them
@@ -161,13 +161,16 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
         )
 
 
-def negative_parameters(optimum: Optimum) -> Iterator[str]:
-    """Yield every mass, damping or stiffness below zero, with its value."""
+def negative_parameters(optimum: Optimum, *, estimated: bool = True) -> Iterator[str]:
+    """Yield every mass, damping or stiffness below zero, with its value.
+
+    With `estimated` false, only those that were given.
+    """
     problem, values = optimum.problem, parameter_values(optimum)
     values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
     for parameter in (e.parameters[0] for e in problem.model.elements if is_single(e)):
         value, error = values[parameter.name], optimum.stderr.get(parameter.name, 0.0)
-        if value < 0.0 and np.isfinite(value):
+        if value < 0.0 and np.isfinite(value) and (estimated or not parameter.free):
             unit = shown_unit(parameter.unit, problem.motion)
             within = " (zero is within two standard errors)" if -value < 2.0 * error else ""
             known = parameter.name not in optimum.names
