@@ -229,6 +229,25 @@ class TestUnusualTables:
         with pytest.raises(DataError, match=r"column 'F': .* is not a number"):
             read_record(written(tmp_path, text))
 
+    @pytest.mark.parametrize("third", ["0,02,1,45,0,38", "0,02,1,4,0", "0,02,1,0"])
+    def test_decimal_commas_between_commas_are_named(self, tmp_path, third):
+        text = f"time [s],x [mm],F [N]\n0,00,1,25,0,31\n0,01,1,35,0,36\n{third}\n0,03,1,5,0,39\n"
+        with pytest.raises(DataError, match=r"3 columns are named .* commas seem to be decimal"):
+            read_record(written(tmp_path, text))
+
+    def test_decimal_commas_in_quotes(self, tmp_path):
+        rows = "".join(f'"0,0{i}","1,{i}5","0,{i}"\n' for i in range(4))
+        record = read_record(written(tmp_path, f"time [s],x [mm],F [N]\n{rows}"))
+        np.testing.assert_allclose(record.displacement, [1.05e-3, 1.15e-3, 1.25e-3, 1.35e-3])
+        np.testing.assert_allclose(record.force, [0.0, 0.1, 0.2, 0.3])
+
+    def test_what_inspect_prints_is_a_column_map(self, tmp_path):
+        path = written(tmp_path, "Zeit (s);Weg (mm);Kraft (N)\n0,0;1,5;2\n0,1;1,7;3\n0,2;2;4\n")
+        with pytest.raises(DataError, match="inspect proposes a column map"):
+            read_record(path)
+        proposal = written(tmp_path, repr(inspect(path)), "columns.toml")
+        assert read_record(path, columns=proposal).force.tolist() == [2.0, 3.0, 4.0]
+
     @pytest.mark.parametrize(
         "stamp", ["2024-03-31T12:00:{:06.3f}", "2024-03-31 12:00:{:06.3f}Z", "12:00:{:06.3f}",
                   "2024-03-31T12:00:{:06.3f}+0200"]

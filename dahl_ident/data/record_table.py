@@ -100,7 +100,7 @@ def _channels(bound: Binding) -> dict[str, RawChannel]:
             f"{source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
             f"displacement, velocity and acceleration. Name it, such as "
             f"{argument('displacement', 'x')}; there are "
-            f"{listed([c.header for c in source.channels], 20)}"
+            f"{listed([c.header for c in source.channels], 20)} (inspect proposes a column map)"
         )
     channels = {motions[0]: bound.required(motions[0])}
     if bound.map.sample_rate is None:

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from textwrap import indent
 
 import numpy as np
 
@@ -70,7 +71,8 @@ class FileContents:
 
     def __repr__(self) -> str:
         listing = as_text(f"{self.name}: {self.format}", self._lines())
-        return f"{listing}\n\n# proposed column map\n{self.column_map}"
+        commented = indent(listing, "# ")  # so that the whole text is a column map
+        return f"{commented}\n\n# proposed column map\n{self.column_map}"
 
     def _repr_html_(self) -> str:
         return as_html(f"{self.name}: {self.format}", self._lines())

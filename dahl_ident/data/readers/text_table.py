@@ -73,6 +73,7 @@ _DIALECTS = (
     ("\t", ","),
     (";", ","),
     ("|", ","),
+    (",", ","),
     (None, "."),
     (None, ","),
     ("\t", ".,"),
@@ -125,6 +126,7 @@ def read_text_table(file: File) -> RawFile:
     refuse_many(name, layout.width, "fields")
     metadata = _metadata(head, name)
     body, runs = _body(data, offset, layout, file)
+    _refuse_decimal_commas(head[: layout.start], body, layout, name)
     _refuse_cut_end(body, layout, name)
     count = max(body.count(b"\n"), body.count(b"\r"))
     file.refuse_above_limit(8 * count * layout.width, f"a table of {count} by {layout.width}")
@@ -220,7 +222,7 @@ def _possible(
     blanks = any(len(_BEFORE_BRACKET.sub("", line).split(None, 1)) > 1 for line in texts)
     for delimiter, mark in dialects:
         split = blanks if delimiter is None else delimiter in text
-        quoted = delimiter != mark[1:] or '"' in text
+        quoted = delimiter is None or delimiter not in mark or '"' in text
         if split and quoted and ("," not in mark or "," in text):
             yield delimiter, mark
 
@@ -387,6 +389,20 @@ def _without_repeated_headers(body: bytes, layout: _Layout) -> tuple[bytes, list
             lines[k] = b""
         runs.append(rows)
     return b"".join(lines), runs
+
+
+def _refuse_decimal_commas(above: list[str], body: bytes, layout: _Layout, name: str) -> None:
+    """Refuse whole numbers between commas that are more than the titles above them."""
+    titles = [n for text in above if (n := text.count(",") + 1) > 1 and not _COMMENT.match(text)]
+    if layout.delimiter != "," or not titles or any(mark in body for mark in (b".", b'"')):
+        return
+    fields = [line.count(b",") + 1 for line in _LINE_END.split(body) if _is_row(line)]
+    if np.median(fields) > titles[-1] and not (layout.header.names and len(set(fields)) == 1):
+        raise DataError(
+            f"{name}: {titles[-1]} columns are named and most lines have more fields, none with a "
+            "decimal point: commas seem to be decimal marks and separators at once. Separate the "
+            "columns by semicolons or tabs, or write decimal points"
+        )
 
 
 def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
