@@ -46,6 +46,21 @@ class Jenkins(di.Friction):
         return sigma * (direction * force < f_max)
 
 
+class Root(di.Friction):
+    """Softens with the root of the force, whose derivative is infinite at 0 N."""
+
+    parameters = di.Dahl.parameters[:2]
+
+    def slope(self, force, direction, velocity, values):
+        f_max, sigma = values
+        return sigma * (1.0 - direction * np.sign(force) * np.sqrt(np.abs(force / f_max)))
+
+
+def root(z, v):
+    """The same by its rate."""
+    return SIGMA * (v - np.abs(v) * np.sign(z) * np.sqrt(np.abs(z) / F_MAX))
+
+
 class Sliders(NamedTuple):
     """Springs in parallel, each with a displacement at which it slips."""
 
@@ -172,6 +187,7 @@ CASES = {
     "Backlash": Case(di.Backlash(di.Dahl(alpha=1.0)), Play(0.001), {**BOTH, "gap": 0.002}),
     "user's law": Case(Exponential(), dahl(), BOTH),
     "user's law with a kink": Case(Jenkins(), ONE, BOTH),
+    "user's law with a root": Case(Root(), root, BOTH),
     "linear system": Case(
         di.LinearSystem(control.tf([1.0], [MASS, DAMPING, STIFFNESS]), quantity="receptance")
         + di.Dahl(alpha=1.0),

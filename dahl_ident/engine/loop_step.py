@@ -102,7 +102,7 @@ def solve_stages(f, psi, h, F, at):
             for e in range(at.k):
                 at.functions[i, e] = w[o + 4 + e]
                 at.turns[i, e] = w[o + at.m + 3 * (4 + e) + 2]
-        remove_pole(at.slopes, 0, 1)
+        remove_pole(at.slopes, 0, 1, at.rates, 0, 1)
         for i in range(STAGES):
             value = -at.stages[i]
             for j in range(STAGES):
@@ -336,7 +336,7 @@ def last_step(f, h, F, columns, turned, at):
                 value = w[by_rate + at.chosen[z - 2]] / omega
                 explicit = w[by_output + at.chosen[z - 2]]
             at.changes[j, z], at.explicit[j, z] = value, explicit
-    remove_pole(at.slopes, 0, 1)
+    remove_pole(at.slopes, 0, 1, at.rates, 0, 1)
     for i in range(STAGES):
         for z in range(columns):
             value = 0.0

@@ -47,6 +47,7 @@ _PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is not a pivo
 NEAR = 1e-10  # of a switching function's largest value: counts as zero
 SIDED = 0.1  # largest relative change of a switching function whose sign is certain
 _POLE = 3.0  # a slope at the end of a step, over the largest before, that counts as infinite
+_GOES_ON = 0.5  # a rate at the end of a step, over the one before, that does not fade
 
 FUNCTION = types.FunctionType(types.void(types.CPointer(float64)))
 NUMBERS, VECTOR, TABLE = int64[::1], float64[::1], float64[:, ::1]
@@ -395,13 +396,17 @@ def read_stage(f, solved, followers, level, i, y, w, at):
 
 
 @compiled
-def remove_pole(slopes, first, between):
-    """Replace a slope at the last stage by that before if it is infinite there.
+def remove_pole(slopes, first, between, rates, rate, next_rate):
+    """Replace a slope at the last stage by that before if it is infinite where the state goes on.
 
     A rate with a power of abs(force) below 1 has such a slope at zero force, where the step ends.
-    Its integral is finite.
+    Its integral is finite. Where the rate of the state fades, the state is at a limit instead, to
+    which an infinite slope binds it.
     """
     last, largest = first + (STAGES - 1) * between, 0.0
+    end = rate + (STAGES - 1) * next_rate
+    if abs(rates[end]) < _GOES_ON * abs(rates[end - next_rate]):
+        return
     for i in range(first, last, between):
         largest = max(largest, abs(slopes[i]))
     if abs(slopes[last]) > _POLE * largest:
@@ -539,9 +544,10 @@ def sensitivities(f, solved, followers, signal, t, h, y, S, first, chosen, w, at
         read_stage(f, solved, followers, 2, i, y, w, at)
     for a in range(R):
         for b in range(n):
-            remove_pole(w, at.state_slopes + solved[a] * n + b, m * n)
+            remove_pole(w, at.state_slopes + solved[a] * n + b, m * n, w, at.values + b, m)
         for b in range(R):
-            remove_pole(w, at.solved_slopes + a * R + b, R * R)
+            rate = at.values + solved[b]
+            remove_pole(w, at.solved_slopes + a * R + b, R * R, w, rate, m)
     w[d : d + STAGES * n * q] = 0.0
     for i in range(STAGES):  # first the terms that do not depend on the solved states
         row, phase = d + i * n * q, signal.omega * (t + NODES[i] * h)

@@ -7,7 +7,9 @@ not fall. All problems take their steps together, until they end.
 
 A problem has converged if the step after the next one, extrapolated from the steps' ratio, would
 change the residuals by less than 1e-8 of their standard deviation, or by less than rounding or the
-accuracy of predictions; it ends with the next step, which needs no further evaluation.
+accuracy of predictions; it ends with the next step, which needs no further evaluation. It has also
+converged if the cost does not fall although a Gauss-Newton step would change the residuals by less
+than 1e-2 of their standard deviation: derivatives are less accurate than costs.
 `scipy.optimize.least_squares` is the other method, with the same residuals and Jacobian.
 """
 
@@ -44,6 +46,8 @@ _EASING = 0.2  # factor on lambda, at least, after a step that lowers the cost a
 _LONGEST_STEP = 2.0  # of a logarithm: a factor of 7, up to which the cost may be quadratic
 # length of a step, over the residuals' standard deviation, at which a search has converged
 _NOISE_TOLERANCE = 1e-8
+# the same, and longest such step of a logarithm, at a point from which the cost does not fall
+_STALLED = 1e-2
 # longest last step of a logarithm, as the Hessian returned is that before this step
 _LAST_STEP = 1e-6
 _GEOMETRIC = 0.9  # squared cosine between two steps of a geometric series
@@ -201,6 +205,7 @@ def minimise(
     converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     last, before = np.full(S, 1e-300), np.zeros((S, P))
+    close = np.zeros(S, dtype=np.bool_)
     # steps of each owner's converged search
     first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)
     for count in range(steps if P else 0):
@@ -216,7 +221,11 @@ def minimise(
         if bounds is not None:  # coordinates with hardly any effect may take long steps
             short = short & (np.abs(step) <= _NEARLY_STILL * (bounds[1] - bounds[0])).all(axis=1)
         settled = settled | (enough is not None and predicted < enough(at.cost))
-        settled &= damping < _GAUSS_NEWTON
+        undamped = damping < _GAUSS_NEWTON
+        near = (moves <= _STALLED**2 * noise) & (longest <= _STALLED)
+        close = np.where(undamped, near, close)
+        stalled = close & ~undamped
+        settled = (settled & undamped) | stalled
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
         if inside is not None:
             lost |= ~inside(at.theta, active)
@@ -228,13 +237,14 @@ def minimise(
             converged[active] = settled
             np.minimum.at(first, owners[settled], count)
             np.minimum.at(lowest, owners[settled], at.cost[settled])
-            ends.assign(active, at.moved(settled & (short | unseen), step, predicted))
+            ends.assign(active, at.moved(settled & ~stalled & (short | unseen), step, predicted))
             kept = ~ended
             active, at = active[kept], at.take(kept)
             if not active.size:
                 break
             step, moves, predicted = step[kept], moves[kept], predicted[kept]
             damping, growth, last, before = damping[kept], growth[kept], last[kept], before[kept]
+            close = close[kept]
         factor = _extrapolation(at.hessian, step, before)
         longest = np.abs(step * logarithmic).max(axis=1)
         factor = np.clip(_LONGEST_STEP / np.maximum(longest, 1e-300), 1.0, factor)
