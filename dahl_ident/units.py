@@ -293,6 +293,12 @@ def percent(share: float, digits: int = 2, *, sign: bool = False) -> str:
     return f"{rounded:{'+' if sign else ''}g} %" if math.isfinite(share) else "-"
 
 
+def counted(number: float, noun: str) -> str:
+    """Return a number of things as text: ``"1 row"``, ``"2 rows"``, ``"3 degrees of freedom"``."""
+    head, of, tail = noun.partition(" of ")
+    return f"{number} {head}{'' if number == 1 else 's'}{of}{tail}"
+
+
 def _common(text: str) -> tuple[float, Dimension] | None:
     """Read a product or quotient of common units; None for any other text."""
     text = text.strip()

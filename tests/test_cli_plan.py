@@ -73,6 +73,10 @@ def test_a_target_out_of_reach_ends_with_3(run):
     [
         ((*RANGES, "--target", "fmax=0.1"), "f_max, sigma, alpha; did you mean 'f_max'?"),
         ((*RANGES, "--force", "1:2:3"), "force is '1:2:3'; expected a number, or low:high"),
+        (
+            (*RANGES, "--displacement", "10mm:0.1mm"),
+            "displacement is '10mm:0.1mm'; expected low:high, the low end below the high",
+        ),
         (("--time", "9s"), "nothing is known about f_max, sigma; give --ranges f_max=low:high"),
         ((*RANGES, "--target", "f_max=a"), "f_max is 'a'; expected a number"),
         ((*RANGES, "--target", "f_max=1", "--target", "sigma"), "with and without a number"),

@@ -260,7 +260,7 @@ def test_a_start_is_completed_and_checked():
 
 def test_too_little_data_are_refused():
     data = FrequencyResponse([1.0], [1.0 + 1.0j], [1.0])
-    with pytest.raises(FitError, match="1 rows give 2 numbers, fewer than the 3 free parameters"):
+    with pytest.raises(FitError, match="1 row, give 2 numbers, fewer than the 3 free parameters"):
         solve(TableProblem(data, Dahl() + Spring()))
     with pytest.raises(ValidationError, match="loss is 'cauchy'; expected linear, huber"):
         solve(TableProblem(data, Dahl()), loss="cauchy")

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+import dahl_ident as di
 from dahl_ident.data import FrequencyResponse, read_frequency_response
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.units import QUANTITIES
@@ -442,6 +444,14 @@ class TestTelling:
         data = FrequencyResponse([1.0], [1j], [1e-3], level=["<b>"])
         assert "&lt;b&gt;" in data._repr_html_()
         assert "<b>" not in data._repr_html_()
+
+    def test_one_of_a_kind_is_singular(self):
+        one = FrequencyResponse([1.0], [1j], [1e-3], level=["a"])
+        text = repr(one)
+        assert "1 point of dynamic stiffness" in text
+        assert "1 level " in text
+        report = di.fit(one, di.Dahl(alpha=1.0), throw=False).fit_report()
+        assert not re.search(r"\b1 (rows|points|levels|parameters|evaluations)\b", report)
 
     def test_many_levels_are_counted(self):
         data = FrequencyResponse(np.arange(1, 31), np.ones(30), np.ones(30), level=np.arange(30))

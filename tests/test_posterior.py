@@ -137,6 +137,8 @@ def test_the_report_names_priors(posterior):
     assert "f_max: log-uniform from" in text
     assert "noise_scale: 1/s" in text
     assert "MISFIT" not in text
+    error = posterior.summary()["mcse"]["f_max"]
+    assert f" {error:.2g} " in next(line for line in text.splitlines() if line.startswith("f_max "))
 
 
 def test_a_prior_dominated_parameter_is_named():

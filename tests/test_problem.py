@@ -487,7 +487,7 @@ def test_free_and_fixed_reach_model_and_sensors():
         (
             lambda: ProblemBatch([data(), FrequencyResponse([1.0], [1.0], [1.0])], FREE),
             DataError,
-            "table 1 has 1 rows of dynamic_stiffness, table 0 has 6 rows",
+            "table 1 has 1 row of dynamic_stiffness, table 0 has 6 rows",
         ),
     ],
 )

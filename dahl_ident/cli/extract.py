@@ -160,7 +160,7 @@ def show(data: FrequencyResponse) -> None:
     """Print one row for each point: its level and run if it has them, values and verdict."""
     import numpy as np
 
-    from dahl_ident.units import si_unit
+    from dahl_ident.units import counted, si_unit
 
     points = _one_row_per_point(data)
     assert points.amplitude is not None  # extraction measures it
@@ -177,7 +177,7 @@ def show(data: FrequencyResponse) -> None:
     }
     shown = {name: cells for name, cells in columns.items() if cells}
     console.table(
-        f"{points.n} points of {points.quantity.replace('_', ' ')} [{points.unit}]",
+        f"{counted(points.n, 'point')} of {points.quantity.replace('_', ' ')} [{points.unit}]",
         list(shown),
         list(zip(*shown.values(), strict=True)),
     )

@@ -65,6 +65,8 @@ def ends(name: str, text: str, unit: str | None = None) -> float | tuple[float, 
     values = numbers(name, text, unit)
     if len(values) > 2:
         raise ValidationError(f"{name} is {text!r}; expected a number, or low:high")
+    if values[0] > values[-1]:
+        raise ValidationError(f"{name} is {text!r}; expected low:high, the low end below the high")
     return values[0] if len(values) == 1 else (values[0], values[1])
 
 

@@ -42,6 +42,7 @@ from dahl_ident.units import (
     Motion,
     Quantity,
     converted,
+    counted,
     jacobian,
     percent,
     si_unit,
@@ -276,9 +277,9 @@ class FrequencyResponse(Tabular):
         name = self.quantity.replace("_", " ")
         lines = [("frequency", extent(self.frequency_hz, "Hz"))]
         if self.levels:
-            lines.append((f"{len(self.levels)} levels", listed(self.levels)))
+            lines.append((counted(len(self.levels), "level"), listed(self.levels)))
         if self.runs:
-            lines.append((f"{len(self.runs)} run{'s'[: len(self.runs) > 1]}", listed(self.runs)))
+            lines.append((counted(len(self.runs), "run"), listed(self.runs)))
         for field in ("amplitude", "drive"):
             values = getattr(self, field)
             if values is not None:
@@ -298,7 +299,7 @@ class FrequencyResponse(Tabular):
         if self.drive_factor_uncertainty:
             lines.append(("drive factor", f"uncertain by {percent(self.drive_factor_uncertainty)}"))
         lines += noted(self.provenance)
-        return f"FrequencyResponse: {self.n} points of {name}, {self.motion}", lines
+        return f"FrequencyResponse: {counted(self.n, 'point')} of {name}, {self.motion}", lines
 
     @property
     def omega(self) -> FloatArray:

@@ -16,7 +16,7 @@ from dahl_ident.data.raw_columns import RawChannel, RawFile, missing_marks
 from dahl_ident.data.record import Record, is_even
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError, argument
-from dahl_ident.units import MOTION_KINDS, si_unit
+from dahl_ident.units import MOTION_KINDS, counted, si_unit
 
 _STAMP = re.compile(
     r"\s*(?P<stamp>(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)"
@@ -45,14 +45,16 @@ def record_from(
             complete &= np.isfinite(numbers)
             for mark in missing_marks(numbers[np.isfinite(numbers)]):
                 bound.warn(
-                    f"{np.sum(numbers == mark)} samples left out: column {channel.name!r} is "
-                    f"{mark:g} in them, a mark of a missing value"
+                    f"{counted(np.sum(numbers == mark), 'sample')} left out: column "
+                    f"{channel.name!r} is {mark:g} in them, a mark of a missing value"
                 )
                 complete &= numbers != mark
         bound.source = source.rows(complete)
         channels = _channels(bound)
         if not complete.all():
-            bound.notes.append(f"{np.sum(~complete)} samples with missing values left out")
+            bound.notes.append(
+                f"{counted(np.sum(~complete), 'sample')} with missing values left out"
+            )
     values: dict[str, Any] = {
         role: _samples(bound, role, channel) for role, channel in channels.items()
     }

@@ -21,6 +21,7 @@ from dahl_ident.units import (
     DRIVE_KINDS,
     MOTION_KINDS,
     Quantity,
+    counted,
     engineering,
     parse_quantity,
     shown_unit,
@@ -139,8 +140,9 @@ class Rows:
         for index, table in enumerate(tables):
             if table.n != first.n or table.quantity != first.quantity:
                 raise DataError(
-                    f"table {index} has {table.n} rows of {table.quantity}, table 0 has "
-                    f"{first.n} rows of {first.quantity}; tables estimated together must agree"
+                    f"table {index} has {counted(table.n, 'row')} of {table.quantity}, "
+                    f"table 0 has {counted(first.n, 'row')} of {first.quantity}; "
+                    "tables estimated together must agree"
                 )
         columns = {n: _stacked(tables, n) for n in COLUMNS if n not in ("level", "run")}
         for name in ("controlled", "harmonic"):

@@ -37,7 +37,7 @@ from dahl_ident.errors import DahlIdentError, FitError, ValidationError, choices
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.optimum import ConstraintCost, Optimum, propagated
 from dahl_ident.problem import TableProblem
-from dahl_ident.units import shown_unit
+from dahl_ident.units import counted, shown_unit
 
 _SPECIFIC = {
     "cross_validation": "held-out tests",
@@ -455,7 +455,7 @@ class TableAssessment(Assessment):
             scale = self.estimate.scale
             error = scale / math.sqrt(2.0 * dof) if dof > 0 else None
             size = with_unit(scale, error, problem.data.unit * (problem.noise == "absolute"))
-            source = f"estimated with {dof} degrees of freedom"
+            source = f"estimated with {counted(dof, 'degree of freedom')}"
             if optimum.is_exact:
                 source = "the limit of rounding; the residuals are smaller"
             lines.append(f"scale {size}, {source}")

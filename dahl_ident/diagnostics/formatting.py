@@ -72,6 +72,8 @@ def degrees_text(dof: Iterable[float]) -> str:
     --------
     >>> degrees_text([24.08]), degrees_text([math.inf]), degrees_text([57.0, 6250.0])
     ('24.1', 'infinite', '57 to more than 1000')
+    >>> degrees_text([24.0, 24.1])
+    '24'
     """
     values = list(dof) or [math.inf]
     least, most = min(values), max(values)
@@ -79,7 +81,7 @@ def degrees_text(dof: Iterable[float]) -> str:
         return "more than 1000" if math.isfinite(least) else "infinite"
     text = f"{least:.3g}"
     last = degrees_text([most]) if most >= _MANY_DOF else f"{most:.3g}"
-    return text if text == last else f"{text} to {last}"
+    return text if f"{least:.2g}" == f"{most:.2g}" else f"{text} to {last}"
 
 
 def listed(words: Sequence[str]) -> str:

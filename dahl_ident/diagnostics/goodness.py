@@ -56,7 +56,7 @@ from dahl_ident.diagnostics.trends import (
     trends,
 )
 from dahl_ident.fitting import Optimum
-from dahl_ident.units import percent
+from dahl_ident.units import counted, percent
 
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
@@ -78,7 +78,7 @@ class ChiSquare:
     p_value: float
 
     def __str__(self) -> str:
-        return f"chi-square {self.value:.4g} with {self.dof} degrees of freedom"
+        return f"chi-square {self.value:.4g} with {counted(self.dof, 'degree of freedom')}"
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
 from dahl_ident.fitting.search import repetitions
 from dahl_ident.problem.space import Space
+from dahl_ident.units import counted
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which limits are value * factor and value / factor
@@ -267,7 +268,7 @@ def intervals_from_search(
         added = ", and the misfit as further noise" if problem.has_misfit else ""
         note = f"noise as given by the data{added}: {law}"
     else:
-        note = f"noise scale estimated: t and F with {optimum.dof} degrees of freedom"
+        note = f"noise scale estimated: t and F with {counted(optimum.dof, 'degree of freedom')}"
     names, units = problem.names[:count], tuple(p.unit for p in problem.parameters[:count])
     return ConfidenceIntervals(
         method, levels, names, units, optimum.values[:count], ends[0], ends[1], note

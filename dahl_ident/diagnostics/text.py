@@ -10,7 +10,7 @@ from typing import Any
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
 from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.errors import argument, spelled
-from dahl_ident.units import percent
+from dahl_ident.units import counted, percent
 
 _MOST_ROWS = 3  # rows listed in the verdict; the details list all
 _LEVEL = level_text(CONFIDENCE)
@@ -51,7 +51,7 @@ def departures(objections: Sequence[str]) -> str:
     """Return the most serious objection, and the number of others."""
     first, *others = objections
     more = len(others)
-    return f"{first}; {more} more test{'s' if more > 1 else ''} failed" if more else first
+    return f"{first}; {counted(more, 'more test')} failed" if more else first
 
 
 def _are(names: Sequence[str]) -> str:
@@ -83,8 +83,8 @@ def _undetermined(determined: Sequence[str], weak: Sequence[str], lost: Sequence
 def _no_degrees_of_freedom(numbers: int, parameters: int, scale_known: bool) -> str:
     judged = "the model" if scale_known else "noise and model"
     return (
-        f"{numbers} numbers and {parameters} parameters leave no degree of freedom to judge "
-        f"{judged}: measure more points."
+        f"{numbers} numbers and {counted(parameters, 'parameter')} leave no degree of freedom to "
+        f"judge {judged}: measure more points."
     )
 
 
@@ -114,7 +114,7 @@ def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> 
     them, these, named = (
         "them",
         "these rows",
-        f"Only {len(names)} of {rows} rows ({which}) contradict",
+        f"Only {len(names)} of {counted(rows, 'row')} ({which}) contradict",
     )
     if len(names) == 1:
         them, these, named = "it", "this row", f"Only the row at {names[0]} contradicts"
@@ -292,9 +292,11 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "misfit": _misfit,
     "large_misfit": "The misfit is {rms:percent} rms, more than half of the response: no "
     "uncertainty can be stated.",
-    "too_few_points": "With {dof} degrees of freedom a wrong model cannot be distinguished from "
-    "noise ({rms:percent} rms misfit): measure more points, or repeat them so that their "
-    "covariance is known.",
+    "too_few_points": lambda rms, dof: (
+        f"With {counted(dof, 'degree of freedom')} a wrong model cannot be distinguished from "
+        f"noise ({percent(rms)} rms misfit): measure more points, or repeat them so that their "
+        "covariance is known."
+    ),
     "one_amplitude": "One amplitude gives no more numbers than friction has parameters, so any "
     "model fits ({rms:percent} rms misfit): measure at other amplitudes as well.",
     "noise": _noise,
@@ -360,7 +362,7 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "it. A quieter displacement would determine more.",
     "effective_samples": lambda effective, samples: (
         "Error bars take the residuals' correlation into account: "
-        f"{effective:.0f} effective of {samples} samples."
+        f"{effective:.0f} effective of {counted(samples, 'sample')}."
     ),
     "not_converged": "{message}",
     "sampled": "{message}",
@@ -371,6 +373,6 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "{compared:list}.",
     "evidence": "ln evidence: {ln:.4f}",
     "warning": "Warning on reading: {text}.",
-    "more_warnings": "{count} more warnings on reading.",
+    "more_warnings": lambda count: f"{counted(count, 'more warning')} on reading.",
     "assumed": _assumed,
 }

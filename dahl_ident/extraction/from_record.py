@@ -46,7 +46,7 @@ from dahl_ident.extraction.sine_fit import (
     sine_fit,
 )
 from dahl_ident.extraction.transient import MOST_CYCLES, estimate_transient
-from dahl_ident.units import percent
+from dahl_ident.units import counted, percent
 
 _NEGLIGIBLE_BIAS = 0.2  # bias over standard error down to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
@@ -216,7 +216,7 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
     verdicts = []
     for good, more, share in zip(settled, missing.astype(int), shares, strict=True):
         too_fast = f"swept too fast to settle, biased by about {percent(share)}"
-        unsettled = f"not settled, {more} more periods" if more else too_fast
+        unsettled = f"not settled, {counted(more, 'more period')}" if more else too_fast
         verdicts.append("; ".join([unsettled][: not good] + shared) or "good")
     return Point(
         frequency_hz=segment.omega / (2.0 * np.pi),

@@ -212,8 +212,8 @@ def _check(problem: Problem, start: Mapping[str, float]) -> None:
         finite_number(value, f"start of {name}")
     if m < len(names):
         raise FitError(
-            f"{problem.extent} give {m} numbers, fewer than the {len(names)} free parameters "
-            f"({', '.join(names)}); measure more points, or fix some"
+            f"the data, {problem.extent}, give {m} numbers, fewer than the "
+            f"{len(names)} free parameters ({', '.join(names)}); measure more points, or fix some"
         )
 
 

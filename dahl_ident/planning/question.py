@@ -61,7 +61,8 @@ class BenchLimits:
             pair = [0.0, float(ends)] if ends.ndim == 0 else ends.tolist()
             if len(pair) != 2 or not pair[0] <= pair[1]:
                 raise ValidationError(
-                    f"{limit(name)} is {value!r}; expected the highest value, or lowest and highest"
+                    f"{limit(name)} is {value!r}; expected the highest value, or the lowest "
+                    "below the highest"
                 )
             checked[name] = tuple(pair)
         return cls(**checked)

@@ -23,6 +23,7 @@ from dahl_ident.errors import DataError, ModelError, ValidationError, argument
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
 from dahl_ident.problem.space import Space
+from dahl_ident.units import counted
 
 if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation
@@ -207,8 +208,7 @@ class RecordWaves(Problem):
     @property
     def extent(self) -> str:
         """The amount of data, in words."""
-        n = len(self.records)
-        return f"{n} record{'s' if n > 1 else ''}, {self.n_samples} samples"
+        return f"{counted(len(self.records), 'record')}, {self.n_samples} samples"
 
     @property
     def output_in_words(self) -> str:

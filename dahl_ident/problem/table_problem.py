@@ -38,7 +38,7 @@ from dahl_ident.problem.prediction import NearbyPredictor, Prediction, Predictor
 from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
 from dahl_ident.sensors import EXACT, Prior, Sensors, measured_stiffness_factor
-from dahl_ident.units import shown_unit
+from dahl_ident.units import counted, shown_unit
 
 _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDictionary()
 """The last orbits of shooting, by table and number of states, shared by the problems of one fit."""
@@ -183,7 +183,7 @@ class TableProblem(Problem):
 
     def __repr__(self) -> str:
         return (
-            f"<{type(self).__name__}: {self._rows.n} rows of {self._rows.quantity}, "
+            f"<{type(self).__name__}: {counted(self._rows.n, 'row')} of {self._rows.quantity}, "
             f"{self.noise} noise, free {', '.join(self.names)}>"
         )
 
@@ -224,7 +224,7 @@ class TableProblem(Problem):
     @property
     def extent(self) -> str:
         """How much was measured, in words."""
-        return f"{self._rows.n} rows"
+        return counted(self._rows.n, "row")
 
     @property
     def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:

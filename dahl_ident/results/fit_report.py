@@ -12,6 +12,7 @@ from dahl_ident.diagnostics.confidence_levels import level_text
 from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 from dahl_ident.results.fitted_model import FittedModel
+from dahl_ident.units import counted
 
 _CORRELATED = 0.1  # least correlation shown; smaller ones change an uncertainty by 0.5 %
 _BRIEF = 15  # most lines of a short report
@@ -127,7 +128,8 @@ def _solver(fit: FittedModel) -> list[str]:
     assumed = [p for p in fit.problem.model.parameters if p.assumed]
     at_assumed = "".join(f", at {p.name} = {p.value:g}" for p in assumed)
     lines = [
-        f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
+        f"{fit.method}, {counted(fit.nfev, 'evaluation')}; {fit.ndata} numbers, "
+        f"{counted(fit.nvarys, 'parameter')}",
         f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}{at_assumed}",
     ]
     if fit.scale_known:  # chi-square is among the tests

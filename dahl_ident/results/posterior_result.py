@@ -236,7 +236,7 @@ class Posterior(PosteriorDraws):
     @property
     def _labels(self) -> list[str]:
         pairs = zip(self.names, self.units, strict=True)
-        return [f"{name} ({unit})" if unit else name for name, unit in pairs]
+        return [f"{name} [{unit}]" if unit else name for name, unit in pairs]
 
     def to_dict(self) -> dict[str, Any]:
         """Return verdict, numbers and priors as plain data; draws are not included."""
@@ -262,7 +262,9 @@ class Posterior(PosteriorDraws):
         return json.dumps(plain_data(self.to_dict(), not_finite=str), allow_nan=False, indent=1)
 
     def __str__(self) -> str:
-        table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
+        table = self.summary().to_string(
+            float_format=lambda v: f"{v:.5g}", formatters={"mcse": lambda v: f"{v:.2g}"}
+        )
         priors = [f"  {name}: {text}" for name, text in self.priors.items()]
         others = [str(f) for f in self.findings if f.code not in ("sampled", "not_converged")]
         return "\n".join([self.message, *others, "", table, "", "Priors:", *priors])

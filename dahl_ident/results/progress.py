@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from dahl_ident.bayes.chain import LENGTH, Chain, ChainSettings, Convergence, Listener
 from dahl_ident.progress import spinner
-from dahl_ident.units import percent
+from dahl_ident.units import counted, percent
 
 
 def expected_steps(settings: ChainSettings, verdict: Convergence | None) -> int | None:
@@ -46,7 +46,7 @@ def fit_progress() -> Iterator[Callable[[int, float], None]]:
     """Yield a function that shows evaluations and unexplained share of variance after 2 s."""
     with spinner("fitting") as show:
         yield lambda evaluations, share: show(
-            f": {evaluations} evaluations, {percent(share**0.5, 3)} rms left"
+            f": {counted(evaluations, 'evaluation')}, {percent(share**0.5, 3)} rms left"
         )
 
 
@@ -54,4 +54,4 @@ def fit_progress() -> Iterator[Callable[[int, float], None]]:
 def grid_progress() -> Iterator[Callable[[int], None]]:
     """Yield a function that shows the number of points after 2 s."""
     with spinner("integrating") as show:
-        yield lambda points: show(f": {points} points")
+        yield lambda points: show(f": {counted(points, 'point')}")
