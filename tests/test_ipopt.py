@@ -253,6 +253,23 @@ def test_inequality_binds_only_where_it_has_to():
     assert tight.values == pytest.approx(equal.values, rel=1e-6)
 
 
+def test_a_calibration_does_not_hide_that_a_constraint_binds():
+    plain, calibrated = (
+        any_fit(
+            friction_data(),
+            Dahl(alpha=1.0),
+            method="ipopt",
+            sensors=sensors,
+            constraints=lambda p: [p["sigma"] >= 310 * p["f_max"]],
+        )
+        for sensors in (None, Sensors(force_gain=stats.norm(1.0, 0.01)))
+    )
+    assert calibrated.optimum.status is Status.AT_BOUND
+    assert calibrated.status is plain.status
+    chances = [fit.optimum.constraint_cost.p_value for fit in (plain, calibrated)]
+    assert chances[1] == pytest.approx(chances[0], rel=1e-3)
+
+
 def test_constraint_holds_a_plant_together():
     problem = TableProblem(plant_data(4, 6), UNKNOWN_PLANT)
 

@@ -60,7 +60,6 @@ _TOLERANCE = 1e-11  # gradient over the sum of squares at which IPOPT ends
 _ITERATIONS = 300  # IPOPT takes ten to thirty steps; a search that needs more does not converge
 # least rms residual over the largest change by a parameter, for the units of data without noise
 _LEAST_RESIDUAL = 1e-4
-_ACTIVE = 1e-6  # distance, in units of the step, at which an inequality holds with equality
 _LN_STEP = 1e-4  # of ln p, for differences of gradients
 _MOST_STARTS = 6  # of the global grid and the user
 _FACTORS = (1.0, 0.01, 100.0)  # of the data's sizes, from which constraints alone are satisfied
@@ -371,8 +370,9 @@ class _Descent:
         self.evaluations += int(stats["n_call_nlp_f"])
         status = str(stats["return_status"])
         failure = "" if status in _SOLVED else _WORDS.get(status, status.replace("_", " ").lower())
-        end, values = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
-        active = tuple(not e and bool(c > -_ACTIVE) for c, e in zip(values, equal, strict=True))
+        end, *pairs = (np.asarray(solution[key]).ravel() for key in ("x", "g", "lam_g"))
+        # distance or multiplier is zero, to a tolerance that differs between problems
+        active = tuple(not e and bool(m > -c) for e, c, m in zip(equal, *pairs, strict=True))
         cost_at_end = 0.5 * float(solution["f"]) / weight
         return _End(
             start + unit * end, cost_at_end, failure, np.asarray(slopes(end)) / unit, active
