@@ -5,6 +5,8 @@ import importlib.util
 import inspect
 import json
 import re
+import shlex
+from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 
@@ -139,6 +141,21 @@ def test_commands_have_the_options_that_are_shown(command, rest, run):
     helped = run(command, "--help").out
     for option in re.findall(r"(?<=\s)--?[a-z][a-z-]*", rest):
         assert option in helped
+
+
+def test_commands_read_what_the_user_has_or_an_earlier_command_wrote():
+    text = README.split("## On the command line\n")[1].split("```")
+    known = set(re.findall(r"`([\w*]+\.\w+)`", text[0]))
+    for line in text[1].strip().splitlines():
+        words = shlex.split(line, comments=True)
+        written = {
+            word
+            for option, word in pairwise(words)
+            if option in ("-o", "--save", "--report", "--resume")
+        }
+        files = {word for word in words if "." in word}
+        assert files - written <= known, line
+        known |= written
 
 
 def test_make_targets_exist():
