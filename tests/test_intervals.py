@@ -406,3 +406,15 @@ def test_profiles_are_searched_only_where_noise_leaves_a_parameter_vague():
     p = found.params["p"]  # not a logarithm: its error counts over its size
     assert 1.0 < p.stderr < 0.1 * abs(p.value)
     assert [one.method for one in found.assessment.computed_intervals(0.9545)] == ["combined"]
+
+
+def test_repetitions_are_calibrated_again():
+    A = np.geomspace(3e-4, 3e-2, 12)
+    noise = 0.005 * np.random.default_rng(1).standard_normal((2, 12))
+    N = Dahl(0.1, 30.0).describing_function(A) * np.exp(noise[0] + 1j * noise[1])
+    sensors = Sensors(force_gain=stats.norm(1.0, 0.01))
+    result = fit(FrequencyResponse(np.ones(12), N, A), Dahl(alpha=1.0), sensors=sensors)
+    drawn = result.conf_interval("bootstrap", levels=0.9545, replicates=199)
+    known = result.conf_interval("combined", levels=0.9545)
+    ratio = (drawn.upper - drawn.lower) / (known.upper - known.lower)
+    assert (np.abs(ratio - 1.0) < 0.2).all()

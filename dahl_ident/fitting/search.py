@@ -192,10 +192,29 @@ def repetitions(
     if problem.kind == "records":
         return solve_repetitions(optimum, count, rng)
     scale = 1.0 if optimum.scale_known else optimum.scale
-    drawn = ProblemBatch.replicates(problem, problem.draw(optimum.theta, scale, count, rng))
-    ends = solve_many(drawn, start=optimum.theta)
-    theta = np.where(np.isfinite(ends.values), ends.theta, np.nan)
-    return theta, np.sqrt(np.diagonal(ends.covariance, axis1=1, axis2=2))
+    responses = problem.draw(optimum.theta, scale, count, rng)
+    drawn = [ProblemBatch.replicates(problem, responses)]
+    if problem.priors:  # calibrations are measurements too
+        drawn = [
+            ProblemBatch.replicates(_calibrated_again(optimum, rng), one[None]) for one in responses
+        ]
+    theta, error = [], []
+    for batch in drawn:
+        ends = solve_many(batch, start=optimum.theta)
+        theta.append(np.where(np.isfinite(ends.values), ends.theta, np.nan))
+        error.append(np.sqrt(np.diagonal(ends.covariance, axis1=1, axis2=2)))
+    return np.concatenate(theta), np.concatenate(error)
+
+
+def _calibrated_again(optimum: Optimum, rng: np.random.Generator) -> TableProblem:
+    """Return the problem with calibrations that are drawn around the estimates."""
+    from scipy import stats
+
+    problem, values = optimum.problem, dict(zip(optimum.names, optimum.values, strict=True))
+    stds = {name: float(prior.std()) for name, prior in problem.priors.items()}
+    drawn = {name: stats.norm(rng.normal(values[name], std), std) for name, std in stds.items()}
+    again: TableProblem = problem.like(sensors=replace(problem.sensors, **drawn))
+    return again
 
 
 def _check(problem: Problem, start: Mapping[str, float]) -> None:
