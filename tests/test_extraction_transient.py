@@ -38,7 +38,8 @@ def departing(beta, cycles, start_force, noise=0.0):
 def estimated(fit):
     X, force = fit.phasors(1)
     transient = estimate_transient(fit, 1, float(np.angle(X)), complex(force / X))
-    return transient, complex(transient.phasors(fit)[1] / X)
+    part = transient.departure * transient.phasor_derivatives(fit)[0, 1]
+    return transient, complex(part / X)
 
 
 @pytest.mark.parametrize("cycles", [3, 10, 40])
@@ -74,6 +75,29 @@ def test_a_drifting_sensor_is_no_memory_where_friction_forgets_fast():
     data = extract(Record(time, displacement=x, force=drifting), harmonics=(1,))
     assert data.quality["settled"].tolist() == [True]
     assert data.response[0] == pytest.approx(FRICTION.describing_function(3.0), rel=1e-3)
+
+
+@pytest.mark.parametrize("beta", [0.03, 0.3])
+def test_a_drifting_sensor_changes_neither_the_response_nor_its_verdict(beta):
+    """From rest; a tenth of the force's amplitude over the level moves the mean by half of it."""
+    n = 15 * PER_CYCLE
+    time = np.arange(n, dtype=np.float64) / PER_CYCLE
+    x = beta * np.sin(2.0 * np.pi * time)  # the reversals are samples
+    force = FRICTION.force(x)
+    size = np.max(np.abs(force))
+    noisy = force + 0.002 * size * np.random.default_rng(4).standard_normal(n)
+    drift = 0.1 * size / time[-1]
+    still, drifting = (
+        extract(Record(time, displacement=x, force=noisy + rate * time), harmonics=(0, 1))
+        for rate in (0.0, drift)
+    )
+    assert drifting.quality["settled"].tolist() == still.quality["settled"].tolist()
+    assert drifting.quality["settling_periods"][0] == still.quality["settling_periods"][0]
+    fundamental, mean = drifting.harmonic == 1, drifting.harmonic == 0
+    assert drifting.response[fundamental] == pytest.approx(still.response[fundamental], rel=1e-6)
+    middle = 0.5 * (drifting.quality["start_time"] + drifting.quality["end_time"])[mean]
+    error = drifting.response[mean].real - drift * middle / beta
+    assert abs(error) < 3.0 * np.sqrt(drifting.covariance[mean, 0, 0])
 
 
 @pytest.mark.parametrize(("noise", "fixed"), [(white, True), (one_over_f, False)])

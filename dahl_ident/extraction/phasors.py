@@ -49,12 +49,12 @@ from dahl_ident.extraction.sine_fit import (
     line_noise,
     sine_fit,
 )
-from dahl_ident.extraction.transient import SIGNIFICANT, Transient
+from dahl_ident.extraction.transient import Transient
 from dahl_ident.units import percent
 
 _LOSS_DISTORTED = 0.02  # share of harmonics above which the fundamental misses percents of the loss
 _MOVING_MEAN = 0.02  # drift of the mean over the amplitude, if the force is controlled
-_BEYOND_NOISE = 5.0  # standard errors above which a drift is more than white noise
+_BEYOND_NOISE = 5.0  # standard errors above which a drift is more than noise
 _LEAST_RESPONSE_STD = 1e-9  # least relative standard deviation of a response
 _ALIASED = 0.01  # alias as a fraction of the fundamental above which it is reported
 _RESIDUAL_SAMPLES = 10_000  # most samples from which the residual is computed
@@ -115,8 +115,9 @@ class Settings:
 class Phasors:
     """Displacement and force of one segment with their noise.
 
-    `fit` excludes the transient if that is significant; `transient_phasors` are its part in the
-    phasors of its channel. `steps` are the resolutions of the two sensors, 0 if there is none.
+    `fit` excludes the transient if that is significant. `transient_derivatives` are those of its
+    part in the phasors of its channel with respect to its size and ln(rate), (2, harmonics).
+    `steps` are the resolutions of the two sensors, 0 if there is none.
     """
 
     fit: SineFit
@@ -124,7 +125,7 @@ class Phasors:
     settings: Settings
     noise: dict[int, LineNoise]
     transient: Transient
-    transient_phasors: ComplexArray
+    transient_derivatives: ComplexArray
     steps: FloatArray
     samples: Samples
 
@@ -145,7 +146,8 @@ class Phasors:
         orders = [1, *sorted({*settings.harmonics, *EVEN} - {1})]
         orders = [k for k in orders if k <= fit.orders]
         noise = dict(zip(orders, line_noise(fit, orders, cycles, fit.residual), strict=True))
-        return cls(fit, cycles, settings, noise, transient, transient.phasors(fit), steps, samples)
+        derivatives = transient.phasor_derivatives(fit)
+        return cls(fit, cycles, settings, noise, transient, derivatives, steps, samples)
 
     @property
     def harmonics(self) -> list[int]:
@@ -161,6 +163,11 @@ class Phasors:
         """Return displacement over the motion channel, and 1 for the force, shape (2,)."""
         s = 1j * max(harmonic, 1) * self.fit.segment.omega  # the mean is not integrated
         return np.array([s**-self.settings.integrations, 1.0], dtype=np.complex128)
+
+    @property
+    def transient_phasors(self) -> ComplexArray:
+        """The transient's part in the phasors 0, 1, ... of its channel."""
+        return np.asarray(self.transient.departure * self.transient_derivatives[0])
 
     def phasors(self, harmonic: int) -> ComplexArray:
         """Return the phasors of the motion channel and the force, shape (2,)."""
@@ -224,12 +231,11 @@ class Phasors:
         return float(np.sqrt(power) / abs(self.fit.phasors(1)[channel]))
 
     def transient_std(self, harmonic: int) -> float:
-        """Return the standard deviation of the output due to that of the transient's size."""
-        if self.settings.transient_channel == self.reference or self.transient.departure == 0.0:
+        """Return the standard deviation of the output due to that of the transient."""
+        if self.settings.transient_channel == self.reference:
             return 0.0
-        added = complex(self.transient_phasors[harmonic])
-        size = abs(added) if harmonic else abs(added.real)
-        return size * self.transient.departure_std / abs(self.transient.departure)
+        J = self.transient_derivatives[:, harmonic]
+        return float(np.sqrt(abs(J.conj() @ self.transient.covariance @ J)))
 
     @property
     def reference_variance(self) -> float:
@@ -278,18 +284,18 @@ class Phasors:
     def mean_moves(self) -> bool:
         """Whether the mean of a free displacement has not settled."""
         # if only a soft spring centres it, its approach is not exponential
-        fit, channel = self.fit, self.settings.transient_channel
-        moved = 2.0 * float(fit.coefficients[1, channel])
+        if self.settings.transient_channel == 1:
+            return False
+        fit = self.fit
+        moved = 2.0 * float(fit.coefficients[1, 0])
         if self.transient.significant:
             first, last = self.transient.waveform(fit.segment)[[0, -1]]
             moved += float(last - first)
-        stderr = 2.0 * np.sqrt(fit.inverse[1, 1] * fit.residual_variance[channel])
-        limit = max(
-            _MOVING_MEAN * abs(self.phasors(1)[0]),
-            _BEYOND_NOISE * float(stderr),
-            SIGNIFICANT * self.transient.departure_std,
-        )
-        return channel == 0 and abs(moved) > limit
+        slow = line_noise(fit, [0], self.cycles, fit.residual)[0].matrix[0, 0].real
+        variance = max(float(fit.residual_variance[0]), float(slow))
+        stderr = 2.0 * float(np.sqrt(fit.inverse[1, 1] * variance))
+        amplitude = float(abs(self.phasors(1)[0]))
+        return abs(moved) > max(_MOVING_MEAN * amplitude, _BEYOND_NOISE * stderr)
 
     @property
     def fundamental(self) -> Row:

@@ -230,15 +230,18 @@ class SineFit:
         cos = self.coefficients[i].astype(np.complex128)
         return np.asarray(cos - 1j * self.coefficients[i + 1] if harmonic else cos)
 
-    def phasors_of(self, waveform: FloatArray) -> ComplexArray:
-        """Return phasors 0, 1, ... of a waveform by the same fit; it is 0 after its last sample."""
-        theta, tau = self.segment.theta[: waveform.size], self.segment.tau[: waveform.size]
-        right = np.zeros(self.inverse.shape[0])
+    def phasors_of(self, waveforms: FloatArray) -> ComplexArray:
+        """Return phasors 0, 1, ... of each waveform by the same fit; 0 after its last sample."""
+        size = waveforms.shape[1]
+        theta, tau = self.segment.theta[:size], self.segment.tau[:size]
+        right = np.zeros((self.inverse.shape[0], len(waveforms)))
         factors = self.segment.attenuation(self.orders)
         for part, block in column_blocks(theta, tau, self.orders, self.trending, factors):
-            right += block @ waveform[part]
-        fitted = (self.inverse @ right)[: 2 * self.orders + 2]
-        return np.asarray(fitted[::2] - 1j * fitted[1::2])
+            right += block @ waveforms[:, part].T
+        fitted = (self.inverse @ right)[: 2 * self.orders + 2].T
+        phasors = fitted[:, ::2] - 1j * fitted[:, 1::2]
+        phasors[:, 0] = fitted[:, 0]
+        return np.asarray(phasors)
 
     def phasor_variance(self, harmonic: int) -> float:
         """Return E abs(phasor error)^2 for white noise of unit variance."""

@@ -6,9 +6,10 @@ For Dahl friction the departure from the steady loop decays with the path s trav
 
 so settling takes cycles, not seconds. D has one sign, so it appears in the mean of the force, or of
 the displacement if the force is controlled. It is estimated by least squares together with
-harmonics and offset, and its part in each harmonic is the remaining bias. If the decay does not
-determine its rate, the rate is drawn to the beta at which Dahl friction has the measured phase. The
-noise of D_0 is taken from the lines below the fundamental, as 1/f noise.
+harmonics, offset and drift, and its part in each harmonic is the remaining bias. If the decay does
+not determine its rate, the rate is drawn to the beta at which Dahl friction has the measured phase.
+The covariance of D_0 and ln(4 beta) is that of least squares with both free (variable projection).
+The noise of D_0 is taken from the lines below the fundamental, as 1/f noise.
 """
 
 from __future__ import annotations
@@ -43,13 +44,19 @@ class Transient:
     """Departure D_0 of one channel from its steady loop, and its `rate`, 4 beta.
 
     D_0 is that where the path of ``cos(theta + displacement_phase)`` is `start` amplitudes.
+    `covariance` is that of D_0 and ln(rate).
     """
 
     departure: float
-    departure_std: float
     rate: float
+    covariance: FloatArray
     displacement_phase: float
     start: float
+
+    @property
+    def departure_std(self) -> float:
+        """Standard deviation of the departure; the uncertainty of the rate counts."""
+        return float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def significant(self) -> bool:
@@ -58,13 +65,17 @@ class Transient:
 
     def waveform(self, segment: Segment) -> FloatArray:
         """Return D at every sample of a segment that continues the phase."""
-        path = _path(segment.theta + self.displacement_phase) - self.start
-        return self.departure * np.exp(-0.25 * self.rate * path)
+        return np.asarray(self.departure * self.derivatives(segment)[0])
 
-    def phasors(self, fit: SineFit) -> ComplexArray:
-        """Return the contribution of D to the fitted phasors 0, 1, ... of its channel."""
+    def derivatives(self, segment: Segment) -> FloatArray:
+        """Return the derivatives of D with respect to D_0 and ln(rate), shape (2, n)."""
+        path = _path(segment.theta + self.displacement_phase) - self.start
+        return _derivatives(self.departure, 0.25 * self.rate * path)
+
+    def phasor_derivatives(self, fit: SineFit) -> ComplexArray:
+        """Return the derivatives of the phasors 0, 1, ... fitted to D, shape (2, harmonics)."""
         part = self.unfaded(fit.segment.theta)
-        return fit.phasors_of(self.waveform(fit.segment.part(part)))
+        return fit.phasors_of(self.derivatives(fit.segment.part(part)))
 
     def unfaded(self, theta: FloatArray) -> slice:
         """Return the samples before it has faded to 1e-12 of its size."""
@@ -79,15 +90,14 @@ def estimate_transient(
 
     The phase of the response, a dynamic stiffness, determines the rate if the decay does not.
     """
-    drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.segment.tau
-    thinned = replace(fit.segment, channels=drifting[None]).thinned()
+    thinned = replace(fit.segment, channels=fit.residual[channel][None]).thinned()
     y = thinned.channels[0]
-    # the harmonics from which a departure is distinguished
-    basis = columns(thinned.theta, thinned.tau, min(HARMONICS, resolvable_orders(thinned)))
-    steady = np.delete(basis, 1, axis=0)
+    # offset, drift and harmonics, from which a departure is distinguished
+    steady = columns(thinned.theta, thinned.tau, min(HARMONICS, resolvable_orders(thinned)))
     steady = np.linalg.solve(np.linalg.cholesky(steady @ steady.T), steady)  # orthonormal
     path = _path(thinned.theta + displacement_phase)
     start = float(_path(fit.segment.theta[:1] + displacement_phase)[0])
+    path -= start
 
     angle = thinned.theta - thinned.theta[0]
     cycles = max(2, round(float(angle[-1]) / (2.0 * np.pi)))
@@ -95,28 +105,41 @@ def estimate_transient(
     tones = powers(np.exp(-1j / cycles * angle), p.size)[1:]
     content = tones @ (y - steady.T @ (steady @ y))
 
-    def variance_of(departure: float, decay: FloatArray) -> float:
-        """Return the variance of white noise with the same effect on D_0 as the slow noise."""
-        decaying = tones @ decay
-        power = np.abs(decaying) ** 2
-        level = float(np.mean(p * np.abs(content - departure * decaying) ** 2)) / decay.size
+    def variance_of(departure: float, decay: FloatArray, estimator: FloatArray) -> float:
+        """Return the variance of white noise with the same effect on ``estimator @ y``."""
+        power = np.abs(tones @ estimator) ** 2
+        noise = np.abs(content - departure * (tones @ decay)) ** 2
+        level = float(np.mean(p * noise)) / decay.size
         return max(level * float(np.sum(power / p) / np.sum(power)), TINY)
 
     rates = _FIRST_RATES
     friction_rates, phases = _friction_phases()
     centre = np.log(np.interp(np.angle(response), phases, friction_rates))
     for _ in range(_REFINEMENTS):
-        decays = np.exp(-0.25 * rates[:, None] * (path - start))
+        decays = np.exp(-0.25 * rates[:, None] * path)
         decays -= decays @ steady.T @ steady
         power = np.einsum("ij,ij->i", decays, decays)
         sizes = decays @ y / power
         gain = sizes**2 * power
         best = int(np.argmax(gain))
-        variance = variance_of(sizes[best], decays[best])
+        variance = variance_of(sizes[best], decays[best], decays[best])
         i = int(np.argmin(((np.log(rates) - centre) / _RATE_SPREAD) ** 2 - gain / variance))
-        departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
+        departure, rate = float(sizes[i]), float(rates[i])
         rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
-    return Transient(float(departure), float(std), float(rate), displacement_phase, start)
+    J = _derivatives(departure, 0.25 * rate * path)
+    J -= J @ steady.T @ steady
+    normal = J @ J.T
+    of_rate = normal[1, 1] + variance / _RATE_SPREAD**2
+    variance = variance_of(departure, J[0], J[0] - normal[0, 1] / of_rate * J[1])
+    normal[1, 1] += variance / _RATE_SPREAD**2
+    covariance = np.asarray(variance * np.linalg.inv(normal), dtype=np.float64)
+    return Transient(departure, rate, covariance, displacement_phase, start)
+
+
+def _derivatives(departure: float, decay: FloatArray) -> FloatArray:
+    """Return the derivatives of ``departure exp(-decay)`` with respect to D_0 and ln(rate)."""
+    factor = np.exp(-decay)
+    return np.stack([factor, -departure * decay * factor])
 
 
 def _path(theta: FloatArray) -> FloatArray:
