@@ -307,9 +307,10 @@ class Profiler:
             bounds=(self._low, self._high),
         ).theta
         step = ends - theta
-        moved = step.any(axis=1, keepdims=True)  # elsewhere derivatives may be infinite
-        bend = np.where(moved, np.einsum("sij,sj->si", lowest.hessian, step), 0.0)
-        change = np.where(moved, (lowest.gradient + 0.5 * bend) * step, 0.0).sum(axis=1)
+        moved = step.any(axis=1)[:, None, None]  # elsewhere derivatives may be infinite
+        bend = np.einsum("sij,sj->si", np.where(moved, lowest.hessian, 0.0), step)
+        slope = np.where(moved[:, 0], lowest.gradient, 0.0) + 0.5 * bend
+        change = (slope * step).sum(axis=1)
         return ends, Quadratic(lowest.cost + change, lowest.gradient + bend, lowest.hessian)
 
     def _quadratic(self, theta: FloatArray) -> Quadratic:
