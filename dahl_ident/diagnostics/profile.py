@@ -307,7 +307,7 @@ class Profiler:
             bounds=(self._low, self._high),
         ).theta
         step = ends - theta
-        moved = step.any(axis=1)[:, None, None]  # elsewhere derivatives may be infinite
+        moved = np.any(step, axis=1, keepdims=True)[..., None]  # elsewhere infinite derivatives
         bend = np.einsum("sij,sj->si", np.where(moved, lowest.hessian, 0.0), step)
         slope = np.where(moved[:, 0], lowest.gradient, 0.0) + 0.5 * bend
         change = (slope * step).sum(axis=1)
