@@ -612,7 +612,7 @@ def test_sensors_are_fixed_free_or_have_a_prior(run):
 
 def test_priors_come_from_a_calibration_sheet(run):
     Path("lab.toml").write_text(
-        "[sample]\nsteps = 30\n[sample.prior]\nf_max = ['10mN', '1N']\n"
+        "[sample]\nsteps = 60\n[sample.prior]\nf_max = ['10mN', '1N']\n"
         'sigma = "lognorm(s=0.1, scale=30)"\n',
         encoding="utf-8",
     )
