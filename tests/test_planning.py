@@ -568,3 +568,11 @@ def _exponent_error(plan):
     if np.linalg.matrix_rank(J, tol=1e-6 * np.abs(J).max()) < 3:
         return float("inf")
     return float(np.sqrt(np.linalg.inv(J.T @ J)[2, 2]))
+
+
+def test_a_target_that_the_data_meet_already_is_said_to_be_met():
+    fit = di.fit(di.load_dataset("noisy"), di.Dahl(alpha=1.0))
+    limits = {"displacement": 0.03, "frequency_hz": 5.0}
+    met, open_target = (str(di.plan(fit, limits=limits, target={"f_max": u})) for u in (0.02, 1e-3))
+    assert "meets the target, which the data at hand meet already" in met
+    assert "at hand" not in open_target

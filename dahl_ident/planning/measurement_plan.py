@@ -301,6 +301,8 @@ class Plan:
         head = f"{number} {'level' if sines else 'motion'}{'s' if number != 1 else ''}"
         head = f"{self.runs} runs of {head}" if self.runs > 1 else head
         end = "; meets the target" if self.reached else "; does NOT meet the target"
+        if all(self.expected[name].before <= most for name, most in self.target.items()):
+            end += ", which the data at hand meet already"
         lines = [f"{head} in {self.seconds:.4g} s{end if self.target else ''}.", ""]
         lines += self._levels() if sines else self._motions()
         rows = [
