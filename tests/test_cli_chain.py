@@ -94,7 +94,8 @@ def test_measured_damper_from_files_to_report(tmp_path, monkeypatch, capsys):
 
 def _channels(contents):
     """Return the options that name displacement and force of these files."""
-    names = [line.split("  ")[1].strip() for line in contents.splitlines() if line.startswith("  ")]
+    lines = [line.removeprefix("#   ") for line in contents.splitlines() if line[:4] == "#   "]
+    names = [line.split("  ")[0].strip() for line in lines]
     displacement = next(name for name in names if "isplacement" in name)
     force = next(name for name in names if "orce" in name and "ctuator" not in name)
     return ["--displacement", displacement, "--force", force]

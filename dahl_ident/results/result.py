@@ -121,7 +121,7 @@ class Result(ABC):
     >>> for result in (di.fit(data, law), di.posterior(data, law, method="grid")):
     ...     print(result.status, result.params["f_max"])
     trusted f_max = 0.09982 ± 0.00031 N
-    trusted f_max = 0.09982 ± 0.00028 N
+    trusted f_max = 0.09982 ± 0.00031 N
     """
 
     _called: ClassVar[str] = "a result"
