@@ -72,6 +72,10 @@ def test_a_target_out_of_reach_ends_with_3(run):
     ("options", "message"),
     [
         ((*RANGES, "--target", "fmax=0.1"), "f_max, sigma, alpha; did you mean 'f_max'?"),
+        (
+            ("--ranges", "fmax=0.05:0.2N"),
+            "ranges of fmax is '0.05N', but no parameter is called fmax",
+        ),
         ((*RANGES, "--force", "1:2:3"), "force is '1:2:3'; expected a number, or low:high"),
         (
             (*RANGES, "--displacement", "10mm:0.1mm"),

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, ValidationError, choices
 
 if TYPE_CHECKING:
     from dahl_ident.bayes.priors import PriorLike
@@ -46,7 +46,12 @@ def _quantity(name: str, text: str, unit: str | None) -> float:
         units = {p.name: p.unit for law in KINDS.values() for p in law.parameters}
         units |= {"displacement_gain": "1", "force_gain": "1", "delay": "s"}
         parameter = name.split()[-1]
-        unit = next((u for n, u in units.items() if f"_{parameter}".endswith(f"_{n}")), "")
+        unit = next((u for n, u in units.items() if f"_{parameter}".endswith(f"_{n}")), None)
+        if unit is None:
+            known = choices(dict.fromkeys(units), parameter)
+            raise ModelError(
+                f"{name} is {text!r}, but no parameter is called {parameter}; expected {known}"
+            )
     kinds = tuple(kind for kind, both in SI_UNITS.items() if unit in both)
     return parse_quantity(text, kinds, name)[0] if kinds else math.nan
 

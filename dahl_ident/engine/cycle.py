@@ -12,20 +12,9 @@ import numpy as np
 from numba import boolean, complex128, float64, int64, njit, types
 
 from dahl_ident.engine.collocation import SHORTEST, STAGES
+from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR, compiled, eliminate
 from dahl_ident.engine.integrate import Asked, Scratch, advance
-from dahl_ident.engine.radau import (
-    FUNCTION,
-    NUMBERS,
-    TABLE,
-    VECTOR,
-    Signal,
-    at_unit_velocity,
-    compiled,
-    eliminate,
-    layout,
-    put_parameters,
-    restart,
-)
+from dahl_ident.engine.radau import Signal, at_unit_velocity, layout, put_parameters, restart
 
 _SHOTS = 40  # of shooting; five are typical
 # Changes of the initial states over the largest states:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.engine.collocation import POSITIONS, STAGES, VALUE_AT
+from dahl_ident.engine.compiling import compiled
 from dahl_ident.engine.radau import (
     NEAR,
-    compiled,
     evaluate,
     put_interpolated,
     put_states,

@@ -10,6 +10,7 @@ from collections import namedtuple
 import numpy as np
 
 from dahl_ident.engine.collocation import MATRIX, NODES, SLOPE_AFTER, STAGES
+from dahl_ident.engine.compiling import compiled
 from dahl_ident.engine.events import (
     LOCATED,
     choose_branch,
@@ -26,7 +27,6 @@ from dahl_ident.engine.radau import (
     SAFETY,
     SHRINK,
     at_unit_velocity,
-    compiled,
     error_of,
     evaluate,
     guess_stages,

@@ -16,6 +16,7 @@ import numpy as np
 from numba import boolean, complex128, float64, njit, types
 
 from dahl_ident.engine.collocation import MATRIX, SHORTEST, STAGES
+from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR, compiled
 from dahl_ident.engine.loop_step import (
     Work,
     choose_sides,
@@ -31,7 +32,7 @@ from dahl_ident.engine.loop_step import (
     slope_fades,
     solve_stages,
 )
-from dahl_ident.engine.radau import FUNCTION, GROW, NUMBERS, SAFETY, SHRINK, TABLE, VECTOR, compiled
+from dahl_ident.engine.radau import GROW, SAFETY, SHRINK
 
 _LOCATED = 1e-14  # rad: shorter steps count as zero
 _MOST = 500  # steps of a half cycle, in addition to those for the highest harmonic

@@ -23,8 +23,9 @@ from dahl_ident.engine.collocation import (
     VALUE_AT,
     VALUE_BEFORE,
 )
+from dahl_ident.engine.compiling import compiled, eliminate, remove_pole
 from dahl_ident.engine.events import DECADE, FADED, LEFT
-from dahl_ident.engine.radau import NEAR, SIDED, SOLVED, compiled, eliminate, remove_pole
+from dahl_ident.engine.radau import NEAR, SIDED, SOLVED
 
 _NEWTON = 15  # iterations of the stages
 _FLOOR = 1e-6  # of the largest force: smaller local forces are no scale for errors

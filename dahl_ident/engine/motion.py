@@ -29,7 +29,7 @@ _HELD = 10.0  # if the displacement is held: forces to 1e-9, and motions to 1e-8
 _RATED = 10.0  # if the law depends on the speed: it changes most near rest
 _CYCLES = 4  # from rest before Newton's method: a plant is then near its settled motion
 _KERNELS = (
-    *("collocation", "radau", "events", "integrate", "samples", "cycle"),
+    *("collocation", "compiling", "radau", "events", "integrate", "samples", "cycle"),
     *("loop_step", "loop"),
 )
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections import namedtuple
 
 import numpy as np
-from numba import float64, int64, njit, types
 
 from dahl_ident.engine.collocation import (
     CHECKED,
@@ -35,6 +34,7 @@ from dahl_ident.engine.collocation import (
     STAGES,
     VALUE_BEFORE,
 )
+from dahl_ident.engine.compiling import compiled, eliminate, inlined, remove_pole
 
 SHRINK, GROW, SAFETY = 0.1, 6.0, 0.8  # limits and safety of the factor to the next step
 _STAGE_ITERATIONS = 20  # of the stages; two of Newton's method are typical
@@ -43,24 +43,8 @@ _NEAR, _FAST = 1e-2, 0.2  # largest first one of fixed-point iterations, and lar
 _FIXED_POINT = 1e-11  # last one of fixed-point iterations, whose error is a tenth of it
 SOLVED = 1e-7  # last one of Newton's method, whose error is rounding: its square
 _HARDLY = 1e-6  # of the displacement: a smaller follower is no scale for errors
-_PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is not a pivot
 NEAR = 1e-10  # of a switching function's largest value: counts as zero
 SIDED = 0.1  # largest relative change of a switching function whose sign is certain
-_POLE = 3.0  # a slope at the end of a step, over the largest before, that counts as infinite
-_GOES_ON = 0.5  # a rate at the end of a step, over the one before, that does not fade
-
-FUNCTION = types.FunctionType(types.void(types.CPointer(float64)))
-NUMBERS, VECTOR, TABLE = int64[::1], float64[::1], float64[:, ::1]
-"""Types of the kernels' arguments."""
-
-OPTIONS = {
-    "error_model": "numpy",
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-    "_nrt": False,  # counting references to an array takes longer than computing with it
-}
-compiled = njit(**OPTIONS)
-inlined = njit(inline="always", **OPTIONS)
 
 Signal = namedtuple("Signal", "sine amplitude omega knots coefficients")
 """The drive, or the displacement if that is held.
@@ -276,46 +260,6 @@ def add(target, start, factor, source, first, count):
 
 
 @compiled
-def eliminate(matrix, columns, n, q):
-    """Solve matrix x = columns in place by Gaussian elimination; False if singular.
-
-    A row with a large diagonal is not exchanged for one with larger numbers, such as accelerations:
-    rounding would then leave some force where there is none.
-    """
-    for k in range(n):
-        pivot, largest, off_diagonal = k, abs(matrix[k, k]), 0.0
-        for j in range(k + 1, n):
-            off_diagonal = max(off_diagonal, abs(matrix[k, j]))
-        for i in range(k + 1, n if largest < _PIVOT * off_diagonal else 0):
-            if abs(matrix[i, k]) > largest:
-                pivot, largest = i, abs(matrix[i, k])
-        if not 0.0 < largest < np.inf:
-            return False
-        if pivot != k:
-            for j in range(k, n):
-                matrix[k, j], matrix[pivot, j] = matrix[pivot, j], matrix[k, j]
-            for j in range(q):
-                columns[k, j], columns[pivot, j] = columns[pivot, j], columns[k, j]
-        inverse = 1.0 / matrix[k, k]
-        for i in range(k + 1, n):
-            factor = matrix[i, k] * inverse
-            if factor != 0.0:
-                for j in range(k + 1, n):
-                    matrix[i, j] -= factor * matrix[k, j]
-                for j in range(q):
-                    columns[i, j] -= factor * columns[k, j]
-    for k in range(n - 1, -1, -1):
-        inverse = 1.0 / matrix[k, k]
-        for j in range(q):
-            columns[k, j] *= inverse
-        for i in range(k):
-            factor = matrix[i, k]
-            for j in range(q):
-                columns[i, j] -= factor * columns[k, j]
-    return True
-
-
-@compiled
 def guess_stages(h, last, w, at):
     """Extrapolate the stages from the last step's polynomial, or without one at constant rates."""
     n = at.n
@@ -393,24 +337,6 @@ def read_stage(f, solved, followers, level, i, y, w, at):
     if level == 2:
         copy(w, at.state_slopes + i * m * n, o + m, m * n)
         copy(w, at.drive_slopes + i * m * (1 + P), o + m * (1 + n), m * (1 + P))
-
-
-@compiled
-def remove_pole(slopes, first, between, rates, rate, next_rate):
-    """Replace a slope at the last stage by that before if it is infinite where the state goes on.
-
-    A rate with a power of abs(force) below 1 has such a slope at zero force, where the step ends.
-    Its integral is finite. Where the rate of the state fades, the state is at a limit instead, to
-    which an infinite slope binds it.
-    """
-    last, largest = first + (STAGES - 1) * between, 0.0
-    end = rate + (STAGES - 1) * next_rate
-    if abs(rates[end]) < _GOES_ON * abs(rates[end - next_rate]):
-        return
-    for i in range(first, last, between):
-        largest = max(largest, abs(slopes[i]))
-    if abs(slopes[last]) > _POLE * largest:
-        slopes[last] = slopes[last - between]
 
 
 @compiled

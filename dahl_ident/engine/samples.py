@@ -6,17 +6,9 @@ import numpy as np
 from numba import float64, int64, njit, types
 
 from dahl_ident.engine.collocation import STAGES
+from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR
 from dahl_ident.engine.integrate import Asked, Scratch, advance
-from dahl_ident.engine.radau import (
-    FUNCTION,
-    NUMBERS,
-    TABLE,
-    VECTOR,
-    Signal,
-    layout,
-    put_parameters,
-    restart,
-)
+from dahl_ident.engine.radau import Signal, layout, put_parameters, restart
 
 
 @njit(
