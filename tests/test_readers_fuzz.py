@@ -176,7 +176,7 @@ def test_damaged_matlab_file(folder, place, byte, cut):
 
 
 def is_measured(value):
-    """Whether a number is no mark of a missing value, such as 9999: among small ones it is one."""
+    """Return whether a number is data: 9999 among small numbers marks a missing value."""
     size = abs(value)
     is_mark = (size > 900.0 and not f"{size:g}".strip("9.")) or size in (32767.0, 32768.0)
     return value == 0.0 or (size > 1e-30 and not is_mark)

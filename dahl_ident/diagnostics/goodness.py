@@ -182,7 +182,7 @@ class Goodness:
     # root mean square of abs(measured - fitted)/abs(measured), of fundamentals where there are any;
     # of records, of the residuals over that of the measured output's variation
     rms_misfit: float
-    warnings: tuple[str, ...] = ()  # what is impossible or unsafe, and no finding tells
+    warnings: tuple[str, ...] = ()  # what is impossible or unsafe, and is not a finding
     flagged: tuple[str, ...] = ()  # rows that the extraction flagged, with the reason
     chi_square: ChiSquare | None = None  # where the noise's scale is known
     # estimated noise over the size of the response; None where the noise's scale is known

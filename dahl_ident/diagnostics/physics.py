@@ -138,7 +138,7 @@ def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
 
 def physical_warnings(optimum: Optimum) -> Iterator[str]:
     """Yield a sentence for each property of an estimate that is impossible or unsafe."""
-    yield from negative_parameters(optimum, estimated=False)  # findings tell the estimated ones
+    yield from negative_parameters(optimum, estimated=False)  # findings name the estimated ones
     if optimum.status is Status.AT_BOUND:
         at_bounds = values_at_bounds(optimum.problem, optimum.theta, optimum.values)
         yield at_bounds or optimum.message  # that of constraints states them
