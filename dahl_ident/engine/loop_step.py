@@ -338,11 +338,14 @@ def last_step(f, h, F, columns, turned, at):
                 explicit = w[by_output + at.chosen[z - 2]]
             at.changes[j, z], at.explicit[j, z] = value, explicit
     remove_pole(at.slopes, 0, 1, at.rates, 0, 1)
+    for j in range(STAGES):
+        for z in range(columns):
+            at.changes[j, z] += at.slopes[j] * at.S[z]
     for i in range(STAGES):
         for z in range(columns):
             value = 0.0
             for j in range(STAGES):
-                value += MATRIX[i, j] * (at.changes[j, z] + at.slopes[j] * at.S[z])
+                value += MATRIX[i, j] * at.changes[j, z]
             at.columns[i, z] = h * value
         for j in range(STAGES):
             at.matrix[i, j] = -h * MATRIX[i, j] * at.slopes[j]
