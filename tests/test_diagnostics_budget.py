@@ -552,3 +552,14 @@ def test_the_estimate_does_not_depend_on_the_unit_of_force():
     for name in ("f_max", "sigma", "damping"):
         one, other = (params[name] for params in found)
         assert 1e-5 * other.value == pytest.approx(one.value, abs=0.02 * one.stderr)
+
+
+@pytest.mark.parametrize("u_gain", [0.0025, 0.01])
+def test_a_calibration_adds_to_what_leaving_out_tests_shows(u_gain):
+    data = load_dataset("noisy")
+    exact = fit(data, Dahl()).params["f_max"]
+    sensors = Sensors(force_gain=stats.norm(1.0, u_gain))
+    calibrated = fit(data, Dahl(), sensors=sensors)
+    assert "jackknife over tests" in [row.source for row in calibrated.budget()["f_max"].rows]
+    u = np.hypot(exact.stderr, u_gain * exact.value)
+    assert calibrated.params["f_max"].stderr == pytest.approx(u, rel=1e-3)

@@ -385,7 +385,9 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         if estimate.chance < _FALSE_ALARM and len(tests) <= _MOST_REFITS:
             by_tests = jackknife_with_weights(estimate, optimum, tests)
-        C, least = np.asarray(sum(every.values())), by_chance**2 * np.diagonal(by_tests)
+        calibrations = {CHANNELS.get(name, name) for name in problem.priors}
+        seen = [part for name, part in every.items() if name not in calibrations]
+        C, least = np.asarray(sum(seen)), by_chance**2 * np.diagonal(by_tests)
         u2 = np.diagonal(C)
         wider = np.sqrt(np.divide(least, u2, out=np.ones(len(C)), where=(least > u2) & (u2 > 0.0)))
         if (wider > 1.0).any():
