@@ -17,6 +17,7 @@ from dahl_ident import (
     Spring,
     fit,
     load_dataset,
+    posterior,
     response,
 )
 from dahl_ident.diagnostics import budget, error_model
@@ -563,3 +564,6 @@ def test_a_calibration_adds_to_what_leaving_out_tests_shows(u_gain):
     assert "jackknife over tests" in [row.source for row in calibrated.budget()["f_max"].rows]
     u = np.hypot(exact.stderr, u_gain * exact.value)
     assert calibrated.params["f_max"].stderr == pytest.approx(u, rel=1e-3)
+    draws = posterior(data, Dahl(alpha=1.0), sensors=sensors, method="grid", seed=1)
+    alone = posterior(data, Dahl(alpha=1.0), method="grid", seed=1).summary()["std"]["f_max"]
+    assert draws.summary()["std"]["f_max"] == pytest.approx(np.hypot(alone, 0.1 * u_gain), rel=0.03)

@@ -43,8 +43,9 @@ class RowErrors:
     factors: FloatArray  # (n, 2, 2): from a row's residuals to those with noise of unit variance
     dof: float  # nu
     share: float  # p
-    jacobian: FloatArray  # (m, P) of weighted residuals with respect to what the data determine
-    residuals: FloatArray  # (m,) weighted, at the estimate
+    # (M, P) of weighted residuals, those of priors last, with respect to what these determine
+    jacobian: FloatArray
+    residuals: FloatArray  # (M,) weighted, at the estimate
     scale_known: bool  # whether s is 1
     # (P,) estimates of parameters that differ from run to run, search coordinates; NaN for others
     centre: FloatArray
@@ -75,17 +76,17 @@ class RowErrors:
 
     def _log_integral(self, variances: FloatArray) -> float:
         """Return ln of the likelihood's integral over parameters and scale, less constants."""
-        root = np.sqrt(variances)
-        Q, R = np.linalg.qr(self.turn @ self.jacobian / root[:, None])
-        z = self.turn @ self.residuals / root
+        root, m = np.sqrt(variances), self.turn.shape[1]
+        J, y = self.jacobian, self.residuals
+        Q, R = np.linalg.qr(np.vstack([self.turn @ J[:m] / root[:, None], J[m:]]))
+        z = np.append(self.turn @ y[:m] / root, y[m:])
         squares = float(z @ z - np.sum((Q.T @ z) ** 2))
         if self.inside is not None:  # where rows share nothing
-            y = self.residuals
-            squares += max(float(y @ y - np.sum((y @ self.inside) ** 2)), 0.0)
+            squares += max(float(y[:m] @ y[:m] - np.sum((y[:m] @ self.inside) ** 2)), 0.0)
         size = -float(np.log(np.abs(np.diagonal(R))).sum())
         if self.scale_known:
             return size - 0.5 * squares
-        return size - 0.5 * (len(self.residuals) - len(R)) * float(np.log(squares))
+        return size - 0.5 * (len(y) - len(R)) * float(np.log(squares))
 
     def at_centre(self, theta: FloatArray) -> FloatArray:
         """Return theta, (S, P), with parameters that differ from run to run at their centre."""

@@ -487,13 +487,14 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     # residuals in units of the noise of each single row, or of an unknown scale
     unit, size = (1.0, 1.0) if problem.scale_known else (errors.noises[0], estimate.scale)
     root = np.sqrt(unit * errors.state.weights[errors.state.model.group[:m]])
-    jacobian = size * root[:, None] * estimate.columns[:m]
+    jacobian = size * estimate.columns
+    jacobian[:m] *= root[:, None]
     columns = [
         v**0.5 * root[:, None] * s.columns[:m]
         for v, s in zip(errors.variances.tolist(), errors.sources, strict=True)
     ]
     basis = None  # of the directions in which rows share errors, where these are few
-    stacked = np.hstack([jacobian, *columns])
+    stacked = np.hstack([jacobian[:m], *columns])
     if m > 2 * stacked.shape[1]:
         basis, _ = np.linalg.qr(stacked)
         columns = [basis.T @ one for one in columns]
@@ -525,7 +526,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
         factors,
         *_dof_and_share(errors),
         jacobian,
-        size * root * estimate.y[:m],
+        size * np.append(root * estimate.y[:m], estimate.y[m:]),
         problem.scale_known,
         np.where(scatters, errors.theta, np.nan),
         np.where(scatters, slopes[:m], 0.0),
