@@ -375,8 +375,9 @@ def test_a_wrong_model_is_not_trusted():
     assert not fit.trusted
 
 
-def test_clipped_samples_are_named_and_not_trusted():
-    record = recorded(DAHL, "multisine", 2000, 1e-4)
+@pytest.mark.parametrize("noise", [1e-4, 5e-3])
+def test_clipped_samples_are_named_and_not_trusted(noise):
+    record = recorded(DAHL, "multisine", 2000, noise)
     assert "clipped" not in di.fit(record, di.Dahl()).verdict
     held = np.clip(record.force, -0.07, 0.07)
     verdict = di.fit(dataclasses.replace(record, force=held), di.Dahl()).verdict

@@ -37,7 +37,7 @@ from dahl_ident.diagnostics.physics import (
 )
 from dahl_ident.diagnostics.record_assessment import RecordAssessment
 from dahl_ident.diagnostics.record_misfit import REMEDY
-from dahl_ident.extraction.segment_quality import clipped_share, sensor_step, white_noise
+from dahl_ident.extraction.segment_quality import clipped_share, sensor_step
 from dahl_ident.fitting.losses import LOSSES
 from dahl_ident.units import si_unit
 
@@ -374,7 +374,7 @@ def _clipped(fit: RecordAssessment) -> Iterator[Finding]:
         force = "drive" if record.force is None else "force"
         waves = {record.motion_channel: record.motion_samples, force: record.force_samples}
         for channel, samples in waves.items():
-            share = clipped_share(samples, sensor_step(samples), white_noise(samples))
+            share = clipped_share(samples, sensor_step(samples))
             weight = len(record) / fit.problem.n_samples
             shares[channel] = shares.get(channel, 0.0) + weight * share
     for channel, share in shares.items():

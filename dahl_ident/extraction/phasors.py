@@ -362,10 +362,9 @@ class Phasors:
         fit, steps = self.fit, self.steps
         shares = fundamental_share(fit, fit.segment, self.samples.lost_variance(fit.segment))
         amplitudes, block = np.abs(fit.phasors(1)), fit.segment.block
-        noise = np.sqrt(np.diagonal(self.noise[1].matrix).real * block)
         crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase / block)
         longest = (crest, np.inf)
-        clipped = list(map(clipped_share, self.samples.channels, steps, noise, longest))
+        clipped = list(map(clipped_share, self.samples.channels, steps, longest))
         with np.errstate(divide="ignore"):
             in_steps = amplitudes / steps
         return {

@@ -32,6 +32,7 @@ _RAIL_RUN = 5  # samples in a row at an extreme value that may be clipped
 _CORNER = 3  # samples within which a clipped waveform leaves the rail
 _DEPARTURE = 1e-4  # fraction of the span by which it is then away from the rail
 _SEEN, _VISIBLE = 0.75, 1e-6  # steps, and fraction of the span: noise that constant values lack
+_BEYOND_CHANCE = 3.0  # standard deviations by which a count of samples exceeds another
 _ORDERS = 3, 6  # of differences, whose sizes agree for white noise, but not for a motion
 _AGREE = 1.5  # largest ratio of these sizes
 _NORMAL_QUARTILE = 0.3186  # of a normal variable's absolute value, in standard deviations
@@ -94,29 +95,30 @@ def white_noise(samples: FloatArray) -> float:
     return min(sizes) if max(sizes) < _AGREE * min(sizes) else 0.0
 
 
-def clipped_share(samples: FloatArray, step: float, noise: float, crest: float = np.inf) -> float:
-    """Return the fraction of samples in runs of constant extreme values that end in a corner.
+def clipped_share(samples: FloatArray, step: float, crest: float = np.inf) -> float:
+    """Return the fraction of samples that are clipped.
 
-    A force in slip is as constant without noise, or where the sensor's step hides the noise. Then
-    only the `crest` of a sine, so many samples, is known to be shorter than such a run.
+    Where noise is seen, its extreme values are rare: more samples at the extreme value than one
+    step below are clipped. Where it is not, runs of constant extreme values that end in a corner
+    are. A force in slip is as constant then, so only runs longer than the `crest` of a sine count.
     """
     highest, lowest = float(samples.max()), float(samples.min())
     span = highest - lowest
     tolerance = max(0.5 * step, _SAME_VALUE * span)
-    seen = noise > max(_SEEN * step, _VISIBLE * span)
-    longest = _RAIL_RUN if seen else max(_RAIL_RUN, 1.5 * crest)
+    noise_is_seen = white_noise(samples) > max(_SEEN * step, _VISIBLE * span)
     stuck = 0
-    for rail, at_rail in (
-        (highest, samples > highest - tolerance),
-        (lowest, samples < lowest + tolerance),
-    ):
+    for depth in (highest - samples, samples - lowest):
+        at_rail = depth < tolerance
+        if noise_is_seen:
+            at, below = int(at_rail.sum()), int(((depth < step + tolerance) & ~at_rail).sum())
+            stuck += at if at - below > _BEYOND_CHANCE * np.sqrt(at + below) else 0
+            continue
         edges = np.flatnonzero(np.diff(at_rail, prepend=False, append=False))
         starts, stops = edges[::2], edges[1::2]
-        before = samples[np.maximum(starts - _CORNER, 0)]
-        after = samples[np.minimum(stops + _CORNER - 1, samples.size - 1)]
-        corner = np.minimum(np.abs(before - rail), np.abs(after - rail)) > _DEPARTURE * span
-        runs = (stops - starts)[corner]
-        stuck += int(runs[runs > longest].sum())
+        before = depth[np.maximum(starts - _CORNER, 0)]
+        after = depth[np.minimum(stops + _CORNER - 1, samples.size - 1)]
+        runs = (stops - starts)[np.minimum(before, after) > _DEPARTURE * span]
+        stuck += int(runs[runs > max(_RAIL_RUN, 1.5 * crest)].sum())
     return stuck / samples.size
 
 
