@@ -43,6 +43,7 @@ from dahl_ident.data.storage import (
     put_in_place,
     read_text,
     regular,
+    with_texts,
     write_whole,
 )
 from dahl_ident.errors import DataError, ModelError, argument
@@ -96,7 +97,7 @@ class Campaign:
         path = self.folder / "results.csv"
         if not path.exists():
             raise DataError(f"{path}: there is no table yet; run the campaign, not a dry run")
-        return as_before_inert(pd.read_csv(path, dtype={"device": str, "run": str}))
+        return with_texts(pd.read_csv(path, dtype={"device": str, "run": str}), as_before_inert)
 
     def report(
         self,

@@ -184,16 +184,12 @@ def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
 
 def inert(frame: pd.DataFrame) -> pd.DataFrame:
     """Return a table in which texts that are formulas to a spreadsheet start with an apostrophe."""
-    return _with_texts(frame, lambda text: f"'{text}" if _is_formula(text) else text)
+    return with_texts(frame, lambda text: f"'{text}" if _is_formula(text) else text)
 
 
-def as_before_inert(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the table before :func:`inert`."""
-
-    def without_apostrophe(text: str) -> str:
-        return text[1:] if text[:1] == "'" and _is_formula(text) else text
-
-    return _with_texts(frame, without_apostrophe)
+def as_before_inert(text: str) -> str:
+    """Return a text of a table before :func:`inert`."""
+    return text[1:] if text[:1] == "'" and _is_formula(text) else text
 
 
 def _is_formula(text: str) -> bool:
@@ -206,7 +202,7 @@ def _is_formula(text: str) -> bool:
     return False
 
 
-def _with_texts(frame: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFrame:
+def with_texts(frame: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFrame:
     """Return a table with each text changed, in cells and in column names."""
 
     def cell(value: Any) -> Any:

@@ -10,14 +10,25 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from itertools import islice, product, zip_longest
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import CELL, TRACE, RawChannel, RawFile, plain, split_header, words
+from dahl_ident.data.raw_columns import (
+    CELL,
+    TRACE,
+    RawChannel,
+    RawFile,
+    cell_text,
+    plain,
+    split_header,
+    words,
+)
 from dahl_ident.data.readers.file import File, refuse_many, utf8
 from dahl_ident.data.readers.tables import (
     Header,
@@ -33,12 +44,9 @@ from dahl_ident.data.storage import METADATA_MARK, as_before_inert, read_metadat
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 _COMMENT = re.compile(r"\s*(?:#|%|//|!)")
-_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
-_LINE_END = re.compile(rb"\r\n|\n|\r")
+_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)", re.MULTILINE)
+_LINE_END, _LINE_END_TEXT = re.compile(rb"\r\n|\n|\r"), re.compile(r"\r\n|\n|\r")
 _BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is one field
 # the length of text in brackets is limited, so that a line of brackets takes linear time
 _BLANK_SEPARATED = re.compile(r"(?:\[[^\]]{0,60}\]|\([^)]{0,60}\)|\S)+")
@@ -47,6 +55,8 @@ _HEAD_LINES = 4  # least number of lines, whatever their length
 _LONGEST_LINE = 1 << 18  # bytes, for more than 10,000 columns
 _MOST_COMMENTS = 20_000  # lines, before the first numbers or among them, to limit the time
 _MANY_LINES = 50  # with so many, an equal number of decimals is a format, not chance
+_LAST_LINES = 400  # in which the number of decimals is compared
+_ROWS_AT_ONCE = 1 << 16  # as lists of cells, which take much memory
 _FOOTER_LINES = 20  # most lines left out; more text after the numbers is an error
 _ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # a spreadsheet's error
 # the number of points above pairs of numbers, as in traces of the SR785 and SR780
@@ -62,30 +72,12 @@ _LIKE_DATA = (
     "in each. Delete the line, or put a number there"
 )
 _INTEGER = re.compile(r"-?\d{1,18}")
-_FLOAT = re.compile(r"-?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|-?inf")
-_WORD = re.compile(r"(?!(?i:true|false|nan|na|null|none|inf|infinity)$)[A-Za-z][A-Za-z_]*")
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
-_DIALECTS = (
-    ("\t", "."),
-    (";", "."),
-    (",", "."),
-    ("|", "."),
-    ("\t", ","),
-    (";", ","),
-    ("|", ","),
-    (",", ","),
-    (None, "."),
-    (None, ","),
-    ("\t", ".,"),
-    (";", ".,"),
-    (",", ".,"),
-    ("|", ".,"),
-    (None, ".,"),
-    ("\t", ",."),
-    (";", ",."),
-    ("|", ",."),
-)
+_DIALECTS = tuple(product(("\t", ";", ",", "|", None), (".", ",", ".,", ",.")))
 _LAST_DIALECTS = ((":", "."), (":", ","))  # tried last, as times of day contain colons
+
+_Parsed = tuple[list[NDArray[Any]], Callable[[int], int], list[int]]
+"""Columns, the line of each row from the first, and the first rows of further runs."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +93,7 @@ class _Layout:
     start: int
     width: int
     header: Header
-    repeated: bytes = b""
+    repeated: str = ""
     comments: tuple[str, ...] = ()
 
 
@@ -116,21 +108,20 @@ def read_text_table(file: File) -> RawFile:
     if trace is not None:
         data = _LINE_END.findall(trace[0])[0] + data[trace.end() :]  # lines keep their numbers
     lines = _head(data, name)
-    layout = _layout([text for _, text in lines], name)
-    offset = lines[layout.start][0]
     head = [text for _, text in lines]
-    rows = [
-        None if not t.strip() or _COMMENT.match(t) else _split(t, layout.delimiter) for t in head
-    ]
+    layout = _layout(head, name)
+    rows = [None if _skipped(text) else _split(text, layout.delimiter) for text in head]
     refuse_second_header(rows, layout.start, layout.mark, lambda i: f"{name}, line {i + 1}")
     refuse_many(name, layout.width, "fields")
     metadata = _metadata(head, name)
-    body, runs = _body(data, offset, layout, file)
-    _refuse_decimal_commas(head[: layout.start], body, layout, name)
-    _refuse_cut_end(body, layout, name)
+    _refuse_data_in_comments(head[: layout.start], layout, name)
+    _refuse_decimal_commas(rows, layout, name)
+    body = data[lines[layout.start][0] :]
     count = max(body.count(b"\n"), body.count(b"\r"))
     file.refuse_above_limit(8 * count * layout.width, f"a table of {count} by {layout.width}")
-    columns = _parse(body, layout, metadata, name)
+    large = len(body) > _SMALL_TABLE and not metadata.get("text")
+    block = _block(body, layout, rows[layout.start] or [], name) if large else None
+    columns, places, runs = block or _rows(body, layout, metadata, file)
     named = layout.header
     if trace is not None:
         points, count = int(trace[1]), len(columns[0])
@@ -153,7 +144,7 @@ def read_text_table(file: File) -> RawFile:
         channels,
         headerless=not named.names,
         decimal=layout.mark,
-        row_name=lambda i: f"line {layout.start + 1 + _places(body)[i]}",
+        row_name=lambda i: f"line {layout.start + 1 + places(i)}",
         metadata=metadata,
         runs=tuple(runs),
         stated={} if metadata else stated_levels(head[: layout.start]),
@@ -197,7 +188,7 @@ def _split(line: str, delimiter: str | None) -> list[str]:
 
 def _layout(lines: list[str], name: str) -> _Layout:
     """Find dialect and start of the numbers, and read the header above them."""
-    skipped = [not text.strip() or _COMMENT.match(text) is not None for text in lines]
+    skipped = [_skipped(text) for text in lines]
     texts = [text for text, skip in zip(lines, skipped, strict=True) if not skip]
     for dialects in (_DIALECTS, _LAST_DIALECTS):
         trials = (
@@ -256,8 +247,8 @@ def _in_dialect(
         named = header(_commented(lines[:start], delimiter), run.width, filled)
         comments = tuple(text.strip() for text in lines[:start]) if named.names else ()
         repeated = next((text for text in reversed(comments) if text), "")
-    repeated_line = repeated.encode() if named.names else b""
-    layout = _Layout(delimiter, mark, start, run.width, named, repeated_line, comments)
+    repeated = repeated if named.names else ""
+    layout = _Layout(delimiter, mark, start, run.width, named, repeated, comments)
     return (bool(named.names), run.score), layout
 
 
@@ -282,48 +273,127 @@ def _metadata(lines: Iterable[str], name: str) -> Mapping[str, Any]:
     return {}
 
 
-def _body(data: bytes, offset: int, layout: _Layout, file: File) -> tuple[bytes, list[int]]:
-    """Return the lines of numbers, with all others blanked, and the first rows of the runs."""
-    body = data[offset:]
-    above = _LINE_END.split(data[:offset])[:-1]
-    for i in range(len(above) - 1, -1, -1):  # upwards through the comments directly above
-        text = above[i].decode("utf-8", "replace")
-        if text.strip() and not _COMMENT.match(text):
+def _skipped(text: str) -> bool:
+    """Return whether a line is blank or a comment."""
+    return not text.strip() or _COMMENT.match(text) is not None
+
+
+def _refuse_data_in_comments(above: list[str], layout: _Layout, name: str) -> None:
+    """Refuse comments directly above the numbers that are rows themselves."""
+    for i in range(len(above) - 1, -1, -1):
+        if not _skipped(above[i]):
             break
-        if _looks_like_data(text, layout):
-            raise DataError(f"{file.name}, line {i + 1}: {_LIKE_DATA.format(text.strip()[:40])}")
-    commented = any(mark in body for mark in (b"#", b"%", b"//", b"!"))
-    if commented:
-        _refuse_odd_comments(body, layout, file.name)
-    body, footers = _without_footers(body, layout)
-    file.notes.extend(f"left out below the table: {text.strip()[:60]!r}" for text in footers)
-    body, runs = _without_repeated_headers(body, layout)
-    if runs:
-        rows = listed([i + 1 for i in runs])
-        file.notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
-    return _COMMENT_LINE.sub(b"", body) if commented else body, runs
+        if _looks_like_data(above[i], layout):
+            raise DataError(f"{name}, line {i + 1}: {_LIKE_DATA.format(above[i].strip()[:40])}")
 
 
-def _refuse_odd_comments(body: bytes, layout: _Layout, name: str) -> None:
-    """Refuse comments among the numbers that are rows, or another header."""
-    for count, comment in enumerate(_COMMENT_LINE.finditer(body)):
-        text = comment[0].decode("utf-8", "replace")
-        if _looks_like_data(text, layout):
-            why = _LIKE_DATA.format(text.strip()[:40])
-        elif _is_another_header(text, layout):
-            why = (
-                f"{text.strip()[:60]!r} names the columns again, with other units, marks or order; "
-                "expected one header. Split the file there"
-            )
-        elif count >= _MOST_COMMENTS:
-            why = (
-                f"more than {_MOST_COMMENTS} comments stand among the numbers; expected fewer. "
-                "Delete them"
-            )
-        else:
+def _rows(body: bytes, layout: _Layout, metadata: Mapping[str, Any], file: File) -> _Parsed:
+    """Parse a table without its comments, repeated headers, and the lines below it."""
+    name = file.name
+    lines = _LINE_END_TEXT.split(body.decode("utf-8", "replace"))
+    end = _end(lines, layout)
+    places, runs = array("q"), list[int]()
+    below = [line.strip()[:60] for line in lines[end:] if line.strip()]
+    file.notes.extend(f"left out below the table: {line!r}" for line in below)
+    is_open = end == len(lines) and bool(lines[-1])
+    _refuse_cut_end(lines[max(end - _LAST_LINES, 0) : end], is_open, layout, name)
+    parts: list[list[NDArray[Any]]] = []
+    rows: list[list[str]] = []
+    comments = 0
+    for place, line in enumerate(lines[:end]):
+        if not line.strip():
             continue
-        line = layout.start + 1 + len(_LINE_END.findall(body, 0, comment.start()))
-        raise DataError(f"{name}, line {line}: {why}")
+        if layout.repeated and line.strip() == layout.repeated:
+            while rows and not any(map(CELL[layout.mark].fullmatch, rows[-1])):
+                del rows[-1], places[-1]  # a line of that header
+            runs.append(len(places))
+        elif _COMMENT.match(line):
+            comments += 1
+            if why := _objection(line, comments, layout):
+                raise DataError(f"{name}, line {layout.start + 1 + place}: {why}")
+        else:
+            cells = _split(line, layout.delimiter)
+            if len(cells) > layout.width:
+                raise DataError(
+                    f"{name}: line {layout.start + 1 + place} has {len(cells)} fields; "
+                    f"expected {layout.width} as in the lines above"
+                )
+            if len(rows) == _ROWS_AT_ONCE:
+                parts.append([words(column) for column in zip(*rows, strict=True)])
+                rows = []
+            rows.append(cells + [""] * (layout.width - len(cells)))
+            places.append(place)
+    if runs:
+        file.notes.append(
+            "the header is repeated in the file: new runs begin at rows "
+            + listed([i + 1 for i in runs])
+        )
+    if rows:
+        parts.append([words(column) for column in zip(*rows, strict=True)])
+    texts = metadata.get("text", [])
+    if layout.mark[1:]:  # read strictly when they are used: 12,34 is not 1234
+        texts = layout.header.names
+    columns = []
+    for cells, label in zip_longest(zip(*parts, strict=True), layout.header.names):
+        column = np.concatenate(cells)
+        if label not in texts:
+            column = _typed(column.tolist(), layout.mark)
+        elif metadata:
+            column = words(map(as_before_inert, column.tolist()))
+        columns.append(column)
+    return columns, places.__getitem__, runs
+
+
+def _end(lines: list[str], layout: _Layout) -> int:
+    """Return the end of the table: lines of words, "Mean,0.1" or ",," are below."""
+    filled = [i for i in range(len(lines)) if lines[i].strip()]
+    end = len(lines)
+    for i in reversed(filled[1:][-_FOOTER_LINES:]):
+        cells = _split(lines[i], layout.delimiter)
+        if any(cell.strip() for cell in cells):  # otherwise an empty row of a spreadsheet
+            numbers = any(map(CELL[layout.mark].fullmatch, cells))
+            summary = cells[0].strip(" \"':.").casefold() in _SUMMARIES
+            words_first = _FOOTER.match(lines[i]) and cells[0].strip() not in _MISSING
+            if not words_first or (numbers and not summary):
+                break
+        end = i
+    return end
+
+
+def _typed(cells: list[str], mark: str) -> NDArray[Any]:
+    """Return whole numbers, numbers or truth values if all cells are such, otherwise words."""
+    cells = ["" if (cell := c.strip()) in _MISSING else cell for c in cells]
+    if all(map(_INTEGER.fullmatch, cells)):
+        return np.array([int(cell) for cell in cells])
+    if all(not cell or CELL[mark].fullmatch(cell) for cell in cells):
+        return np.array([float(c.replace(mark, ".")) if c else np.nan for c in cells])
+    if {*cells} <= {"True", "False"}:
+        return np.array([cell == "True" for cell in cells])
+    return words(cells)
+
+
+def _objection(comment: str, count: int, layout: _Layout) -> str:
+    """Return what is wrong with a comment among the numbers: it is a row, or another header."""
+    if _looks_like_data(comment, layout):
+        return _LIKE_DATA.format(comment.strip()[:40])
+    if count > _MOST_COMMENTS:
+        return (
+            f"more than {_MOST_COMMENTS} comments stand among the numbers; expected fewer. "
+            "Delete them"
+        )
+    if comment.strip() in layout.comments:
+        return ""
+    cells = next(iter(_commented([comment], layout.delimiter)), [""])
+    names, units = zip(*(split_header(cell) for cell in cells), strict=True)
+    header_names = sorted(plain(name) for name in layout.header.names if name)
+    repeats_names = header_names and sorted(plain(n) for n in names if n) == header_names
+    only_units = len(cells) == layout.header.cells > 1 and not any(units) and are_units(cells)
+    if not repeats_names and not only_units:
+        return ""
+    return (
+        f"{comment.strip()[:60]!r} names the columns again, with other units, marks or order; "
+        "expected one header. Split the file there"
+    )
 
 
 def _looks_like_data(text: str, layout: _Layout) -> bool:
@@ -336,67 +406,13 @@ def _looks_like_data(text: str, layout: _Layout) -> bool:
     return len(cells) == layout.width and bool(numeric) and all(numeric)
 
 
-def _is_another_header(text: str, layout: _Layout) -> bool:
-    """Return whether a comment is a header that does not occur above the numbers."""
-    if text.strip() in layout.comments:
-        return False
-    cells = next(iter(_commented([text], layout.delimiter)), [""])
-    names, units = zip(*(split_header(cell) for cell in cells), strict=True)
-    header_names = sorted(plain(name) for name in layout.header.names if name)
-    return (
-        bool(header_names) and sorted(plain(name) for name in names if name) == header_names
-    ) or (len(cells) == layout.header.cells > 1 and not any(units) and are_units(cells))
-
-
-def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
-    """Blank the lines of words or nothing below the table: "End of data", "Mean,0.1,0.2", ",,"."""
-    footers: list[str] = []
-    end = len(body.rstrip())
-    for _ in range(_FOOTER_LINES):
-        start = max(body.rfind(b"\n", 0, end), body.rfind(b"\r", 0, end)) + 1
-        text = body[start:end].decode("utf-8", "replace")
-        cells = _split(text, layout.delimiter)
-        if any(cell.strip() for cell in cells):  # otherwise an empty row of a spreadsheet
-            numbers = any(CELL[layout.mark].fullmatch(cell) for cell in cells)
-            summary = cells[0].strip(" \"':.").casefold() in _SUMMARIES
-            words_first = _FOOTER.match(text) and cells[0].strip() not in _MISSING
-            if not words_first or (numbers and not summary):
-                break
-        if not start:
-            break
-        footers.insert(0, text)
-        end = len(body[:start].rstrip())
-    return (body[:end] + b"\n" if footers else body), footers
-
-
-def _without_repeated_headers(body: bytes, layout: _Layout) -> tuple[bytes, list[int]]:
-    """Blank every later line that repeats the header, and return the first rows below them."""
-    if not layout.repeated or layout.repeated not in body:
-        return body, []
-    lines = re.split(rb"(\r\n|\n|\r)", body)
-    runs: list[int] = []
-    rows = 0
-    for i in range(0, len(lines), 2):
-        if lines[i].strip() != layout.repeated:
-            rows += _is_row(lines[i])
-            continue
-        lines[i] = b""
-        for k in range(i - 2, -1, -2):  # and the lines of its header above it
-            cells = _split(lines[k].decode("utf-8", "replace"), layout.delimiter)
-            if any(CELL[layout.mark].fullmatch(cell) for cell in cells):
-                break
-            rows -= _is_row(lines[k])
-            lines[k] = b""
-        runs.append(rows)
-    return b"".join(lines), runs
-
-
-def _refuse_decimal_commas(above: list[str], body: bytes, layout: _Layout, name: str) -> None:
+def _refuse_decimal_commas(rows: list[list[str] | None], layout: _Layout, name: str) -> None:
     """Refuse whole numbers between commas that are more than the titles above them."""
-    titles = [n for text in above if (n := text.count(",") + 1) > 1 and not _COMMENT.match(text)]
-    if layout.delimiter != "," or not titles or any(mark in body for mark in (b".", b'"')):
+    titles = [len(row) for row in rows[: layout.start] if row and len(row) > 1]
+    table = [row for row in rows[layout.start :] if row]
+    if layout.delimiter != "," or not titles or any("." in c for row in table for c in row):
         return
-    fields = [line.count(b",") + 1 for line in _LINE_END.split(body) if _is_row(line)]
+    fields = [len(row) for row in table]
     if np.median(fields) > titles[-1] and not (layout.header.names and len(set(fields)) == 1):
         raise DataError(
             f"{name}: {titles[-1]} columns are named and most lines have more fields, none with a "
@@ -405,119 +421,69 @@ def _refuse_decimal_commas(above: list[str], body: bytes, layout: _Layout, name:
         )
 
 
-def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
-    """Refuse a last line with missing fields, or with missing digits and no line end."""
-    start = max(0, len(body) - _HEAD_BYTES)
-    start = max(body.rfind(b"\n", 0, start), body.rfind(b"\r", 0, start)) + 1
-    lines = _LINE_END.split(body[start:])
-    *before, last = [t.decode("utf-8", "replace") for t in lines if _is_row(t)] or [""]
-    cells = _split(last, layout.delimiter)
-    if len(cells) < layout.width:
-        raise DataError(
-            f"{name}: the last line has {len(cells)} fields, {last[:40]!r}, where the others have "
-            f"{layout.width}; the file looks cut off"
-        )
-    if not lines[-1] or len(before) < _MANY_LINES:
+def _refuse_cut_end(lines: list[str], is_open: bool, layout: _Layout, name: str) -> None:
+    """Refuse a last line with missing fields, or, without a line end, with missing digits."""
+    texts = [line for line in lines if not _skipped(line)]
+    rows = [_split(text, layout.delimiter) for text in texts]
+    if not rows:  # comments alone
         return
-    numbers = [_split(line, layout.delimiter)[-1].strip() for line in [last, *before[1:]]]
-    decimals, *others = [len(number.partition(layout.mark)[2]) for number in numbers]
+    if len(rows[-1]) < layout.width:
+        raise DataError(
+            f"{name}: the last line has {len(rows[-1])} fields, {texts[-1][:40]!r}, where the "
+            f"others have {layout.width}; the file looks cut off"
+        )
+    if not is_open or len(rows) <= _MANY_LINES:
+        return
+    numbers = [row[-1].strip() for row in rows]
+    *others, decimals = [len(number.partition(layout.mark)[2]) for number in numbers]
     usual = set(others)
     if len(usual) == 1 and decimals < min(usual):
         raise DataError(
-            f"{name}: the last number, {cells[-1]!r}, has {decimals} decimals and no line end, "
+            f"{name}: the last number, {numbers[-1]!r}, has {decimals} decimals and no line end, "
             f"where all above have {min(usual)}; the file looks cut off"
         )
 
 
-def _is_row(line: bytes) -> bool:
-    """Return whether a line is a row of numbers: not blank, and not a comment."""
-    return bool(line.strip()) and not _COMMENT_LINE.match(line)
-
-
-def _places(body: bytes) -> list[int]:
-    """Return the line of each row, counted from the first, past blank lines and comments."""
-    return [i for i, text in enumerate(_LINE_END.split(body)) if _is_row(text)]
-
-
-def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] | None:
-    """Return the columns of a small table of plain numbers and words, None for any other."""
-    if len(body) > _SMALL_TABLE or layout.mark != "." or b'"' in body or not body.isascii():
-        return None
-    rows = [line.decode().split(layout.delimiter) for line in _LINE_END.split(body) if line.strip()]
-    if any(len(row) != layout.width for row in rows):
-        return None
-    columns: list[NDArray[Any]] = []
-    for i, column in enumerate(zip(*rows, strict=True)):
-        cells = [cell.strip() for cell in column]
-        unpadded = cells == list(column)
-        if str(i) in texts:
-            if not unpadded or any(cell[:1] == "'" for cell in cells):
-                return None
-            columns.append(words(cells))
-        elif all(map(_FLOAT.fullmatch, cells)):
-            whole = all(map(_INTEGER.fullmatch, cells))
-            columns.append(np.array([int(cell) if whole else float(cell) for cell in cells]))
-        elif unpadded and {*cells} <= {"True", "False"}:
-            columns.append(np.array([cell == "True" for cell in cells]))
-        elif unpadded and all(map(_WORD.fullmatch, cells)):
-            columns.append(words(cells))
-        else:
-            return None
-    return columns
-
-
-def _parse(
-    body: bytes, layout: _Layout, metadata: Mapping[str, Any], name: str
-) -> list[NDArray[Any]]:
-    keys = [str(i) for i in range(layout.width)]
-    text_names = metadata.get("text", [])
-    if layout.mark[1:]:  # read strictly when they are used: 12,34 is not 1234
-        text_names = list(layout.header.names)
-    texts = {key for key, n in zip(keys, layout.header.names, strict=False) if n in text_names}
-    small = _small(body, layout, texts)
-    if small is not None:
-        return small
+def _block(body: bytes, layout: _Layout, first: list[str], name: str) -> _Parsed | None:
+    """Parse a large table of rows alike, return None for any other; `first` is the first row."""
     import pandas as pd
 
+    is_number = CELL[layout.mark].fullmatch
+    text = [i for i, c in enumerate(first) if c.strip() not in _MISSING and not is_number(c)]
     # pandas 3.1 reads to the last digit by default, earlier versions only on request
     exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
     precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pd.errors.DtypeWarning)
+        try:
+            frame = pd.read_csv(
+                io.BytesIO(body),
+                sep=layout.delimiter or r"\s+",
+                decimal=layout.mark[0],
+                header=None,
+                names=range(layout.width),
+                skipinitialspace=True,
+                keep_default_na=False,
+                na_values=_MISSING,
+                dtype=dict.fromkeys(text, object),
+                **precision,
+            )
+        except ValueError:
+            return None
+    columns = [frame[i].to_numpy() for i in range(layout.width)]
+    numeric = [column for column in columns if column.dtype.kind in "ifb"]
+    last = body.rstrip().rsplit(b"\n" if b"\n" in body else b"\r", _LAST_LINES)[1:]
+    below = all(np.isnan(column[-1]) for column in numeric)
+    if text and (_COMMENT_LINE.search(body) or _FOOTER.match(last[-1].decode())):
+        below = True
+    if below or len(numeric) + len(text) < layout.width:
+        return None
+    for i in text:
+        columns[i] = words(map(str.strip, map(cell_text, columns[i])))
+    _refuse_cut_end([line.decode() for line in last], body[-1:] not in b"\r\n", layout, name)
 
-    def read(in_parts: bool) -> pd.DataFrame:
-        frame: pd.DataFrame = pd.read_csv(
-            io.BytesIO(body),
-            sep=layout.delimiter or r"\s+",
-            decimal=layout.mark[0],
-            header=None,
-            names=keys,
-            skipinitialspace=True,
-            keep_default_na=False,
-            na_values={key: [""] if key in texts else _MISSING for key in keys},
-            dtype=dict.fromkeys(texts, str),
-            low_memory=in_parts,
-            encoding="utf-8",
-            **precision,
-        )
-        return frame
+    def place(row: int) -> int:
+        filled = (i for i, line in enumerate(_LINE_END.split(body)) if line.strip())
+        return next(islice(filled, row, None))
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.DtypeWarning)
-            try:
-                frame = read(in_parts=True)  # twice as fast, but each part guesses its own types
-            except pd.errors.DtypeWarning:
-                frame = read(in_parts=False)
-    except pd.errors.ParserError as exc:
-        ragged = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(exc))
-        if ragged is None:
-            raise DataError(f"{name}: the table cannot be read: {str(exc).strip()}") from exc
-        raise DataError(
-            f"{name}: line {int(ragged[2]) + layout.start} has {ragged[3]} fields; expected "
-            f"{ragged[1]} as in the lines above"
-        ) from exc
-    except (ValueError, OverflowError) as exc:
-        raise DataError(f"{name}: the table cannot be read: {exc}") from exc
-    if metadata:  # written by this package
-        frame = as_before_inert(frame)
-    columns = (frame[key].to_numpy() for key in keys)
-    return [c if c.dtype.kind in "fiub" else words(c) for c in columns]
+    return columns, place, []
