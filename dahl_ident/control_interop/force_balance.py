@@ -1,7 +1,7 @@
 """All amplitudes at which A |L + N(A)| equals the drive, by the describing function.
 
-L is the linear part of a plant, N the describing function of the other elements; points and vectors
-of parameters are rows of arrays.
+L is the linear part of a plant, N the describing function of the other elements; points are rows of
+arrays.
 
 **Passive points** (Im L >= 0) have one amplitude if the laws are such that it is unique. It is
 found by Newton's method in ln A, within a bracket that follows from the bounds of |N| and A |N|.
@@ -16,119 +16,87 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import EPS, BoolArray, ComplexArray, FloatArray, IntArray
-from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.facts import Sine
-
-_Scalar = TypeVar("_Scalar", bound=np.generic)
-_Values = list[Sequence[FloatArray]]
 
 _ROUNDING_OF_SUMS = 8.0 * EPS  # of sums such as k - m omega^2, relative to the sizes of the terms
 _UNBOUNDED = 1e300  # represents an unbounded amplitude
 _DECADES = 40  # of amplitude below and above 1 m that are searched if N has no bounds
 _SCAN_PER_DECADE = 128  # nodes, 1.8 % apart; closer pairs of roots may be missed
 _COARSE_SCAN = 32  # nodes per decade if only one amplitude is needed
+_EXTREMUM_BISECTIONS = 56  # from 1.8 % of the amplitude to neighbouring numbers
 _POINTS_AT_ONCE = 2**15  # points times nodes computed at once, so that arrays stay in the cache
 
 
 @dataclass(frozen=True)
-class Nonlinear:
-    """The elements that depend on the amplitude, with one or many vectors of their parameters.
+class Balance:
+    """The equation A |L + N(A)| = drive at points, (n,).
 
-    `values` are the parameters of each element, all of shape () or all (vectors,). So is `omega`,
-    which is 0 if no element depends on it.
+    `friction` are the elements that depend on the amplitude, None if there are none, and `values`
+    their parameters at each point, (n, P), followed by the frequency, which is 0 if none of them
+    depends on it.
     """
 
-    elements: tuple[Element, ...]
-    values: tuple[tuple[FloatArray, ...], ...]
-    omega: FloatArray
-    unique: bool
-    """Whether the amplitude is unique if the linear part is passive."""
-
-    def force_and_slope(
-        self, amplitude: FloatArray, vector: IntArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return A N, the fundamental of the force, and its derivative with respect to ln A.
-
-        `vector` is the parameter vector of each row.
-        """
-        force, slope = np.zeros((2, *amplitude.shape), dtype=np.complex128)
-        (omega,) = _rows((self.omega,), vector)
-        for element, values in zip(self.elements, self.values, strict=True):
-            N, by_amplitude, _ = element.settled(_rows(values, vector), Sine(amplitude, omega), 1)
-            force += amplitude * N
-            slope += amplitude * (N + amplitude * by_amplitude)
-        return force, slope
-
-    def on_grid(self, grid: FloatArray, vector: IntArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return the same for several rows on one grid of amplitudes, (rows or 1, n)."""
-        shared = all(v.ndim == 0 for v in (self.omega, *(v for n in self.values for v in n)))
-        vectors, index = np.unique(vector, return_inverse=True)
-        if shared:
-            vectors, index = vectors[:1], np.zeros(1, dtype=np.intp)
-        tables = self.force_and_slope(np.tile(grid, vectors.size), np.repeat(vectors, grid.size))
-        force, slope = (table.reshape(vectors.size, -1)[index] for table in tables)
-        return force, slope
-
-    @cached_property
-    def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Upper bounds of |N| and A |N| for each vector; infinite where unknown."""
-        steepest, largest = np.zeros(()), np.zeros(())
-        for element, values in zip(self.elements, self.values, strict=True):
-            stiffness, force = element.force_bounds(values)
-            steepest, largest = steepest + stiffness, largest + force
-        return steepest, largest
-
-    def is_valid(self) -> BoolArray:
-        """Return which vectors are within the range of the laws, (1,) or (vectors,)."""
-        knees = [e.knee(values) for e, values in zip(self.elements, self.values, strict=True)]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            logs = [np.log(np.atleast_1d(knee)) for pair in knees for knee in pair]
-        return np.asarray(np.isfinite(sum(logs)))
-
-
-@dataclass(frozen=True)
-class Plant:
-    """The equation A |L + N(A)| = drive at every point, in units scaled to the friction.
-
-    All arrays have one entry per point.
-    """
-
+    friction: Model | None
+    values: FloatArray
     linear: ComplexArray
     rounding: FloatArray  # rounding error of L
     drive: FloatArray
-    vector: IntArray
-    unit: FloatArray  # unit of amplitude, m
-    friction: Nonlinear
 
-    def at(self, points: IntArray) -> Plant:
+    def at(self, points: IntArray) -> Balance:
         """Return the equation at some of the points."""
-        names = ("linear", "rounding", "drive", "vector", "unit")
+        names = ("values", "linear", "rounding", "drive")
         return replace(self, **{name: getattr(self, name)[points] for name in names})
+
+    @property
+    def unique(self) -> bool:
+        """Whether the amplitude is unique if the linear part is passive."""
+        return not self.friction or all(e.unique_response for e in self.friction.elements)
+
+    def force_and_slope(self, amplitude: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Return A N, the fundamental of friction, and its derivative with respect to ln A.
+
+        At one amplitude for each point or, if that has a second axis, on a grid, (1, m).
+        """
+        if self.friction is None:
+            zero = np.zeros(amplitude.shape, dtype=np.complex128)
+            return zero, zero
+        values, index = self.values, None
+        if amplitude.ndim > 1:
+            values, index = np.unique(values, axis=0, return_inverse=True)
+            values = values[..., None]
+        *columns, omega = np.moveaxis(values, 1, 0)
+        N, by_amplitude, _ = self.friction.settled(columns, Sine(amplitude, omega), 1)
+        force, slope = amplitude * N, amplitude * (N + amplitude * by_amplitude)
+        return (force, slope) if index is None else (force[index.ravel()], slope[index.ravel()])
 
     def force(self, amplitude: FloatArray) -> ComplexArray:
         """Return A (L + N), the force phasor for a displacement phasor A."""
-        return amplitude * self.linear + self.friction.force_and_slope(amplitude, self.vector)[0]
+        return np.asarray(amplitude * self.linear + self.force_and_slope(amplitude)[0])
 
     def largest_friction(self) -> FloatArray:
-        """Return the fundamental of the friction force in gross slip."""
-        return _rows((self.friction.bounds[1],), self.vector)[0] + np.zeros(self.drive.shape)
+        """Return an upper bound of A |N| at each point: friction in gross slip."""
+        return self._friction_bounds()[1]
+
+    def _friction_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return upper bounds of |N| and A |N| at each point; infinite where unknown."""
+        if self.friction is None:
+            return np.zeros(self.drive.shape), np.zeros(self.drive.shape)
+        steepest, largest = self.friction.force_bounds(list(self.values.T[:-1]))
+        return steepest + np.zeros(self.drive.shape), largest + np.zeros(self.drive.shape)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return a lower and an upper bound of all solutions."""
-        steepest, largest = _rows(self.friction.bounds, self.vector)
+        steepest, largest = self._friction_bounds()
         stiffness = np.abs(self.linear)
         with np.errstate(divide="ignore", over="ignore"):
             low = 0.999 * self.drive / (stiffness + steepest)
             high = np.minimum(1.001 * (self.drive + largest) / stiffness, _UNBOUNDED)
-        bounded = np.isfinite(steepest) & np.isfinite(largest)
-        unbounded = np.flatnonzero(~np.broadcast_to(bounded, stiffness.shape))
+        unbounded = np.flatnonzero(~np.isfinite(steepest + largest))
         grid = 10.0 ** np.arange(-_DECADES, _DECADES, 0.25)
         for start in range(0, unbounded.size, _POINTS_AT_ONCE // grid.size):
             points = unbounded[start : start + _POINTS_AT_ONCE // grid.size]
@@ -140,7 +108,7 @@ class Plant:
     def _grid_bounds(self, grid: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return grid amplitudes outside which A |Z| is far from the drive."""
         with np.errstate(all="ignore"):
-            total = self.linear[:, None] * grid + self.friction.on_grid(grid, self.vector)[0]
+            total = self.linear[:, None] * grid + self.force_and_slope(grid[None])[0]
             ratio = np.abs(total) / self.drive[:, None]
         reached = ~(ratio < 0.1)  # also true where A |Z| overflows
         first = np.where(reached.any(axis=1), reached.argmax(axis=1) - 1, grid.size - 1)
@@ -148,80 +116,34 @@ class Plant:
         return grid[np.maximum(first, 0)], grid[np.minimum(last + 1, grid.size - 1)]
 
 
-def flatten(
+def balance_of(
     model: Element, values: Sequence[FloatArray], omega: FloatArray, drive: FloatArray
-) -> tuple[Plant, tuple[int, ...]]:
-    """Return the plant at every point of the broadcast arguments, and their shape."""
+) -> tuple[Balance, tuple[int, ...]]:
+    """Return the equation at every point of the broadcast arguments, and their shape."""
     shape = np.broadcast_shapes(np.shape(omega), np.shape(drive), *(np.shape(v) for v in values))
     linear, size = np.zeros((), dtype=np.complex128), np.zeros(())
-    elements: list[Element] = []
-    friction: _Values = []
+    friction: list[Element] = []
+    columns: list[FloatArray] = []
     for element, numbers in as_model(model).of(values):
         if element.is_linear:
             part = element.stiffness(numbers, np.zeros(()), omega)
             linear, size = linear + part, size + np.abs(part)
         else:
-            elements.append(element)
-            friction.append(numbers)
-    rates = [] if all(e.rate_independent for e in elements) else [np.asarray(omega)]
-    index: IntArray | None = None
-    if rates and rates[0].ndim == 1 and all(np.shape(v)[-1:] in ((), (1,)) for v in values):
-        distinct, index = np.unique(rates[0], return_inverse=True)
-        rates = [distinct]
-    finite = [np.isfinite(v) for numbers in friction for v in numbers]
-    if not all(np.all(f) for f in finite):  # a search overflowed; there is no amplitude there
-        valid = np.all(np.broadcast_arrays(*finite), axis=0)
-        linear = np.where(valid, linear, np.nan)
-        friction = [[np.where(valid, v, 1.0) for v in numbers] for numbers in friction]
-    force, stiffness, friction = _units(elements, friction)
-    batch = np.broadcast_shapes(*(np.shape(v) for numbers in (*friction, rates) for v in numbers))
-    vectors = np.arange(np.prod(batch, dtype=np.intp)).reshape(batch)
-    if index is not None:
-        vectors = vectors[..., index]
-    nonlinear = Nonlinear(
-        tuple(elements),
-        tuple(tuple(_flat_values(v, batch) for v in numbers) for numbers in friction),
-        _flat_values(rates[0], batch) if rates else np.zeros(()),
-        all(element.unique_response for element in elements),
+            friction.append(element)
+            columns += numbers
+    columns.append(np.zeros(()) if all(e.rate_independent for e in friction) else omega)
+    table = np.stack([np.broadcast_to(column, shape).ravel() for column in columns], axis=-1)
+    valid = np.isfinite(table).all(axis=1)  # a search may overflow; there is no amplitude there
+    table[~valid] = 1.0
+    rounding = _ROUNDING_OF_SUMS * size
+    balance = Balance(
+        Model(*friction) if friction else None,
+        table,
+        np.where(valid, np.broadcast_to(linear, shape).ravel(), np.nan),
+        np.broadcast_to(rounding, shape).ravel(),
+        np.broadcast_to(drive, shape).ravel(),
     )
-    return Plant(
-        _flat(linear / stiffness, shape),
-        _flat(_ROUNDING_OF_SUMS * size / stiffness, shape),
-        _flat(drive / force, shape),
-        _flat(vectors, shape),
-        _flat(force / stiffness, shape),
-        nonlinear,
-    ), shape
-
-
-def _units(
-    elements: Sequence[Element], friction: _Values
-) -> tuple[FloatArray, FloatArray, _Values]:
-    """Return units of force and stiffness, and the friction parameters in these units.
-
-    In suitable units a single element, such as Dahl friction with a given exponent, has the same
-    parameters in every vector.
-    """
-    if len(friction) == 1 and elements[0].rate_independent:
-        force, stiffness, numbers = elements[0].normalised(friction[0])
-        if all(np.size(v) and np.all(v == np.ravel(v)[0]) for v in numbers):
-            return force, stiffness, [[np.asarray(np.ravel(v)[0]) for v in numbers]]
-    return np.ones(()), np.ones(()), friction
-
-
-def _flat_values(values: FloatArray, batch: tuple[int, ...]) -> FloatArray:
-    return _flat(values, batch) if np.prod(batch) > 1 else np.reshape(values, ())
-
-
-def _flat(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:
-    """Return the broadcast array in one dimension; a single number is not copied."""
-    if np.size(array) == 1:
-        return np.broadcast_to(np.ravel(array), int(np.prod(shape)))
-    return np.broadcast_to(array, shape).ravel()
-
-
-def _rows(values: Sequence[FloatArray], vector: IntArray) -> list[FloatArray]:
-    return [v[vector] if v.ndim else v for v in values]
+    return balance, shape
 
 
 def solve(
@@ -238,8 +160,8 @@ def solve(
     amplitude. Of several amplitudes it is the one whose ratio to `start` is nearest to 1, by
     default the smallest; two may be missed if A |Z| has two extrema within 7.5 % of amplitude.
     """
-    plant, shape = flatten(model, values, omega, drive)
-    roots = find_roots(plant, _COARSE_SCAN) * plant.unit[:, None]
+    balance, shape = balance_of(model, values, omega, drive)
+    roots = find_roots(balance, _COARSE_SCAN)
     if start is None or roots.shape[1] == 1:
         return roots[:, 0].reshape(shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -249,49 +171,34 @@ def solve(
     return np.take_along_axis(roots, nearest, axis=1).reshape(shape)
 
 
-def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> FloatArray:
-    """Return all amplitudes of every point in the plant's units, shape (points, largest number).
+def find_roots(balance: Balance, per_decade: int = _SCAN_PER_DECADE) -> FloatArray:
+    """Return all amplitudes of every point, shape (points, largest number).
 
     They increase along a row, and are followed by NaN. `per_decade` is the number of nodes per
     decade of amplitude in the search for several.
     """
-    resonant = np.abs(plant.linear) <= plant.rounding
-    if not plant.friction.elements:
-        with np.errstate(divide="ignore", over="ignore"):
-            return np.where(resonant, np.nan, plant.drive / np.abs(plant.linear))[:, None]
-    known = np.isfinite(plant.linear)
-    if plant.friction.unique:
-        valid = plant.friction.is_valid()
-        known &= valid[plant.vector] if valid.size > 1 else valid
-    passive = known & plant.friction.unique & (plant.linear.imag >= -plant.rounding)
-    single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
-    amplitude = np.full(plant.drive.shape, np.nan)
-    if single.any():
-        amplitude[single] = _single_roots(plant.at(np.flatnonzero(single)))
-    others = np.flatnonzero(known & ~passive)
-    if not others.size:
-        return amplitude[:, None]
-    point, crossing = _scan(plant, others, per_decade)
+    linear, drive, largest = balance.linear, balance.drive, balance.largest_friction()
+    known = np.isfinite(linear)
+    passive = known & balance.unique & (linear.imag >= -balance.rounding)
+    resonant = np.abs(linear) <= balance.rounding
+    single = np.flatnonzero(passive & ~(resonant & (drive >= largest)))
+    with np.errstate(divide="ignore", invalid="ignore"):  # in gross slip the friction is known
+        slipping = np.sqrt(drive - largest) * np.sqrt(drive + largest) / np.abs(linear)
+    low, high = balance.bounds()
+    rising = np.ones(single.size, dtype=np.bool_)
+    unique = _polish(balance.at(single), low[single], high[single], slipping[single], rising)
+    others = np.flatnonzero(known & ~passive & ~np.isnan(low + high))  # NaN outside a law's range
+    point, several = _scan(balance, others, low, high, per_decade)
     _, first, counts = np.unique(point, return_index=True, return_counts=True)
     column = np.arange(point.size) - np.repeat(first, counts)
-    roots = np.full((amplitude.size, 1 + int(column.max(initial=0))), np.nan)
-    roots[:, 0] = amplitude
-    roots[point, column] = crossing
+    roots = np.full((drive.size, 1 + int(column.max(initial=0))), np.nan)
+    roots[single, 0] = unique
+    roots[point, column] = several
     return roots
 
 
-def _single_roots(plant: Plant) -> FloatArray:
-    """Return the amplitude of each passive point."""
-    low, high = plant.bounds()
-    largest = plant.largest_friction()
-    with np.errstate(divide="ignore", invalid="ignore"):  # in gross slip the friction is known
-        slipping = np.sqrt(plant.drive - largest) * np.sqrt(plant.drive + largest)
-        start = slipping / np.abs(plant.linear)
-    return _polish(plant, low, high, start, np.ones(low.shape, dtype=bool))
-
-
 def _polish(
-    plant: Plant, low: FloatArray, high: FloatArray, start: FloatArray, rising: BoolArray
+    balance: Balance, low: FloatArray, high: FloatArray, start: FloatArray, rising: BoolArray
 ) -> FloatArray:
     """Return the amplitude in each bracket, by Newton steps in ln A, otherwise by bisection.
 
@@ -302,8 +209,10 @@ def _polish(
     amplitude = np.where((start > low) & (start < high), start, np.sqrt(low) * np.sqrt(high))
     active = np.arange(amplitude.size)
     for _ in range(200):
-        A, part = amplitude[active], plant.at(active)
-        force, slope = part.friction.force_and_slope(A, part.vector)
+        if not active.size:
+            break
+        A, part = amplitude[active], balance.at(active)
+        force, slope = part.force_and_slope(A)
         linear = A * part.linear
         total = linear + force
         # amplification of rounding near a sharp resonance, where L and N cancel
@@ -324,84 +233,64 @@ def _polish(
         )
         converged |= inside & (np.abs(step) * kappa < 1e-8)
         active = active[~converged]
-        if not active.size:
-            break
     return amplitude
 
 
-class _Cells(NamedTuple):
-    """Cells of a grid in which A |Z| crosses the drive, or may cross it twice at an extremum."""
-
-    point: IntArray
-    low: FloatArray
-    high: FloatArray
-    above_low: BoolArray  # whether A |Z| exceeds u_0 at the lower end
-    above_high: BoolArray  # and at the upper end
-    falling: BoolArray  # whether it falls at the lower end
-
-    def take(self, mask: BoolArray) -> _Cells:
-        point, low, high, *signs = self
-        return _Cells(point[mask], low[mask], high[mask], *(sign[mask] for sign in signs))
-
-
-def _scan(plant: Plant, points: IntArray, per_decade: int) -> tuple[IntArray, FloatArray]:
+def _scan(
+    balance: Balance, points: IntArray, low: FloatArray, high: FloatArray, per_decade: int
+) -> tuple[IntArray, FloatArray]:
     """Return all amplitudes of the chosen points, as pairs (point, amplitude) in rising order."""
-    low, high = plant.at(points).bounds()
-    bounded = ~np.isnan(low + high)  # outside the range of a law there is no solution
-    points, low, high = points[bounded], low[bounded], high[bounded]
     if not points.size:
-        return points, low
-    chosen = plant.at(points)
-    order = np.argsort(high)  # groups the few points near a resonance, which need a long grid
-    decades = np.log10(high[order[order.size // 2]] / low.min())
+        return points, np.zeros(0)
+    order = points[np.argsort(high[points])]  # the few near a resonance need a long grid
+    decades = np.log10(high[order[order.size // 2]] / low[points].min())
     block = max(1, int(_POINTS_AT_ONCE / (per_decade * max(decades, 1.0))))
     parts = []
-    for first in range(0, points.size, block):
+    for first in range(0, order.size, block):
         part = order[first : first + block]
         least, most = low[part].min(), high[part].max()
         nodes = 2 + int(np.ceil(per_decade * (np.log10(most) - np.log10(least))))
-        parts.append(_cells(chosen.at(part), part, np.geomspace(least, most, nodes)))
-    cells = _Cells(*map(np.concatenate, zip(*parts, strict=True)))
-    crosses = cells.above_low != cells.above_high
-    once = cells.take(crosses)
-    twice, between = _double_crossings(chosen, cells.take(~crosses))
-    point = np.concatenate((once.point, twice.point, twice.point))
-    amplitude = _polish(
-        chosen.at(point),
-        np.concatenate((once.low, twice.low, between)),
-        np.concatenate((once.high, between, twice.high)),
-        np.full(point.shape, np.nan),
-        np.concatenate((~once.above_low, ~twice.above_low, twice.above_low)),
-    )
+        row, *bracket = _brackets(balance.at(part), np.geomspace(least, most, nodes))
+        parts.append((part[row], *bracket))
+    point, left, right, rising = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    amplitude = _polish(balance.at(point), left, right, np.full(point.shape, np.nan), rising)
     order = np.lexsort((amplitude, point))
-    return points[point[order]], amplitude[order]
+    return point[order], amplitude[order]
 
 
-def _cells(plant: Plant, numbers: IntArray, grid: FloatArray) -> _Cells:
-    """Return the cells of all points, with their numbers, that contain or may contain roots."""
-    force, slope = plant.friction.on_grid(grid, plant.vector)
-    linear, drive = plant.linear[:, None], plant.drive[:, None]
-    above, falling, near = _compared(linear, drive, grid, force, slope, grid[1] / grid[0])
+def _brackets(
+    balance: Balance, grid: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+    """Return brackets of all amplitudes on a grid: point, ends, and whether A |Z| rises there."""
+    above, falling, near = _compared(balance, grid[None], grid[1] / grid[0])
     crosses = above[:, 1:] != above[:, :-1]
     turns_towards = (falling[:, :-1] == above[:, :-1]) & (falling[:, 1:] != above[:, 1:])
-    row, cell = np.nonzero(crosses | (turns_towards & (near[:, 1:] | near[:, :-1])))
-    ends = above[row, cell], above[row, cell + 1]
-    return _Cells(numbers[row], grid[cell], grid[cell + 1], *ends, falling[row, cell])
+    once = np.nonzero(crosses)
+    twice = np.nonzero(~crosses & turns_towards & (near[:, 1:] | near[:, :-1]))
+    falls, (row, cell) = above[twice], twice
+    extremum = _extremum(balance.at(row), grid[cell], grid[cell + 1], falls)
+    beyond = _compared(balance.at(row), extremum)[0] != falls
+    row, cell, extremum, falls = row[beyond], cell[beyond], extremum[beyond], falls[beyond]
+    return (
+        np.concatenate([once[0], row, row]),
+        np.concatenate([grid[once[1]], grid[cell], extremum]),
+        np.concatenate([grid[once[1] + 1], extremum, grid[cell + 1]]),
+        np.concatenate([~above[once], ~falls, falls]),
+    )
 
 
 def _compared(
-    linear: ComplexArray,
-    drive: FloatArray,
-    amplitude: FloatArray,
-    force: ComplexArray,
-    slope: ComplexArray,
-    ratio: FloatArray,
+    balance: Balance, amplitude: FloatArray, ratio: float = 1.0
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return whether A |Z| exceeds u_0, whether it falls, and whether it is near u_0.
+    """Return whether A |Z| exceeds the drive u_0, whether it falls, and whether it is near u_0.
 
-    `force` and `slope` are A N and its derivative with respect to ln A. It is near if a change of A
-    by the factor `ratio`, with twice the largest possible slope of A |Z| at A, reaches u_0.
+    It is near if a change of A by the factor `ratio`, with twice the largest possible slope of
+    A |Z| at A, reaches u_0.
     """
+    force, slope = balance.force_and_slope(amplitude)
+    linear, drive = balance.linear, balance.drive
+    if amplitude.ndim > 1:
+        linear, drive = linear[:, None], drive[:, None]
     total, slope = linear * amplitude + force, linear * amplitude + slope
     size = np.abs(total)
     falling = (total.conj() * slope).real < 0.0
@@ -409,25 +298,10 @@ def _compared(
     return size > drive, falling, near
 
 
-def _double_crossings(plant: Plant, cells: _Cells) -> tuple[_Cells, FloatArray]:
-    """Return the cells in which A |Z| crosses u_0 twice, and an amplitude between the two.
-
-    The extremum is approached by bisection until A |Z| has crossed u_0 or is too far from it.
-    """
-    crossed, between = np.zeros(cells.point.shape, dtype=np.bool_), np.empty(cells.point.shape)
-    low, high = cells.low.copy(), cells.high.copy()
-    active = np.arange(crossed.size)
-    while active.size:
-        middle = np.sqrt(low[active]) * np.sqrt(high[active])
-        part = plant.at(cells.point[active])
-        force, slope = part.friction.force_and_slope(middle, part.vector)
-        above, falling, near = _compared(
-            part.linear, part.drive, middle, force, slope, high[active] / low[active]
-        )
-        beyond = above != cells.above_low[active]
-        continues = near & ~beyond & (middle > low[active]) & (middle < high[active])
-        crossed[active[beyond]], between[active[beyond]] = True, middle[beyond]
-        before = falling == cells.falling[active]
-        low[active[before]], high[active[~before]] = middle[before], middle[~before]
-        active = active[continues]
-    return cells.take(crossed), between[crossed]
+def _extremum(balance: Balance, low: FloatArray, high: FloatArray, falls: BoolArray) -> FloatArray:
+    """Return the amplitude in each bracket at which A |Z|, which `falls` at first, turns."""
+    for _ in range(_EXTREMUM_BISECTIONS if low.size else 0):
+        middle = np.sqrt(low) * np.sqrt(high)
+        before = _compared(balance, middle)[1] == falls
+        low, high = np.where(before, middle, low), np.where(before, high, middle)
+    return low

@@ -29,7 +29,7 @@ from dahl_ident.arrays import (
     positive_array,
 )
 from dahl_ident.control_interop.exact_response import HARMONICS, exact_motions
-from dahl_ident.control_interop.force_balance import find_roots, flatten
+from dahl_ident.control_interop.force_balance import balance_of, find_roots
 from dahl_ident.data.columns import one_of
 from dahl_ident.elements.driven_motion import LINEAR, NEUTRAL, STEADY, Shooting, Steady, obstacle
 from dahl_ident.elements.element import Element, Model, as_model
@@ -206,15 +206,13 @@ def response(
     shape = broadcast_shape(frequency_hz=f, drive=u0)
     plant = as_model(plant)
     with np.errstate(over="ignore"):
-        points, _ = flatten(plant, plant.known_values(), 2.0 * np.pi * f, u0)
+        points, _ = balance_of(plant, plant.known_values(), 2.0 * np.pi * f, u0)
         _check_range(np.minimum(points.bounds()[0], 1.0))  # infinite without any stiffness
-        roots = find_roots(points)
-        _check_range(roots)
-        amplitude = roots * points.unit[:, None]
+        amplitude = find_roots(points)
         _check_range(amplitude)
-    exists = np.isfinite(roots)
-    force = points.at(np.nonzero(exists)[0]).force(roots[exists])
-    X: ComplexArray = np.full(roots.shape, np.nan, dtype=np.complex128)
+    exists = np.isfinite(amplitude)
+    force = points.at(np.nonzero(exists)[0]).force(amplitude[exists])
+    X: ComplexArray = np.full(amplitude.shape, np.nan, dtype=np.complex128)
     with np.errstate(invalid="ignore"):  # the law may have no settled loop
         X[exists] = amplitude[exists] * (force.conj() / np.abs(force))
     harmonics = np.where(np.array(HARMONICS) == 1, X[..., None], 0.0)
@@ -226,7 +224,7 @@ def response(
     moving = omega > 0.0
     exact = moving if steady == "exact" and not why else np.zeros(moving.shape, dtype=np.bool_)
     if exact.any():
-        unique = points.friction.unique & (points.linear.imag[exact] >= 0.0)
+        unique = points.unique & (points.linear.imag[exact] >= 0.0)
         motions = exact_motions(plant, omega[exact], u[exact], X[exact], unique)
         padding = ((0, 0), (0, motions.multiplier.shape[1] - X.shape[1]))
         multiplier = np.pad(multiplier, padding, constant_values=np.nan)

@@ -242,11 +242,6 @@ class Dahl(Friction):
             parts = (*parts, by_alpha)
         return _scaled(values, sine, parts[: general_dahl.COUNTS[derivatives]])
 
-    def normalised(self, values: Values) -> tuple[FloatArray, FloatArray, Values]:
-        """Return f_max, sigma and one for each, with the numbers that shape the loop."""
-        f_max, sigma, *shape = values
-        return f_max, sigma, (np.ones(()), np.ones(()), *shape)
-
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:

@@ -218,14 +218,6 @@ class ForceLaw(ABC):
         """
         return harmonic == 1 if self.is_linear else harmonic % 2 == 1
 
-    def normalised(self, values: Values) -> tuple[FloatArray, FloatArray, Values]:
-        """Return a force, a stiffness, and the values in these units, of which fewer vary.
-
-        ``N(A; values) = stiffness * N(A stiffness/force; values in these units)``. By default 1,
-        1 and the values themselves.
-        """
-        return np.ones(()), np.ones(()), values
-
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
