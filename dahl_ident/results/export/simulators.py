@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import accumulate
 from typing import Any
 
 import jinja2
@@ -22,10 +23,9 @@ _EXPONENT_MATTERS = 0.02  # error of the force over f_max due to the exponent
 
 @dataclass(frozen=True)
 class Law:
-    """A friction element: its kind, its equation, and its values by the parameters of its class."""
+    """A friction element: its kind, and its values by the parameters of its class."""
 
     kind: str
-    equation: str
     values: Mapping[str, float]
 
     def __getitem__(self, name: str) -> float:
@@ -60,7 +60,7 @@ def device(result: Any, form: str, supported: Mapping[str, str]) -> Device:
         if element.kind in LUMPED and element.kind in supported:
             lumped[LUMPED[element.kind]] += values[LUMPED[element.kind]]
         elif element.kind in supported:
-            laws.append(Law(element.kind, element.equation, values))
+            laws.append(Law(element.kind, values))
         else:
             raise ModelError(
                 f"{form} carries {', '.join(supported)}, and the model has {element.kind}; fit "
@@ -109,11 +109,20 @@ _COULOMB = {
 }
 
 
+def _rendered(template: str, **values: Any) -> str:
+    """Return the text of a template in this folder."""
+    environment = jinja2.Environment(
+        trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    source = (files(__package__) / template).read_text("utf-8")
+    return str(environment.from_string(source).render(values))
+
+
 def mujoco(result: Any) -> str:
     """Return a joint with a passive motor that has the friction of the fit as LuGre friction."""
     parts = device(result, "mujoco", {"dahl": "", "lugre": "", **dict.fromkeys(LUMPED, "")})
     notes, motors, damping = list(parts.notes), [], parts.damping
-    for number, law in enumerate(parts.laws, start=1):
+    for law in parts.laws:
         f_max = static = law["f_max"]
         micro, speed = 0.0, 1.0  # without effect, as both limits are equal
         if law.kind == "dahl":
@@ -121,55 +130,19 @@ def mujoco(result: Any) -> str:
         else:
             static, speed = short(f_max * law["static_ratio"]), law["stribeck_speed"]
             micro, damping = law["micro_damping"], damping + law["viscous"]
-        numbers = _numbers(law["sigma"], micro, f_max, static, speed)
-        motors.append(
-            f'    <dcmotor name="friction{number}" joint="joint" input="none" motorconst="0 0" '
-            f'resistance="1" lugre="{numbers}"/>'
-        )
-    actuators = ["  <actuator>", *motors, "  </actuator>"] if motors else []
+        motors.append((law["sigma"], micro, f_max, static, speed))
     notes.append("lugre: stiffness, damping, Coulomb, static, Stribeck; MuJoCo 4 or later")
-    return _mjcf(parts, notes, damping, 0.0, actuators)
+    return _rendered(
+        "mjcf.xml.j2", parts=parts, notes=notes, damping=damping, limit=0.0, motors=motors
+    )
 
 
 def frictionloss(result: Any) -> str:
     """Return a joint with a friction limit only, for any release of MuJoCo."""
     parts = device(result, "mujoco-frictionloss", _COULOMB)
     limit = sum(_limit(law, "mujoco-frictionloss") for law in parts.laws)
-    return _mjcf(parts, parts.notes, parts.damping, limit, ())
-
-
-def _mjcf(
-    parts: Device, notes: Sequence[str], damping: float, limit: float, actuators: Sequence[str]
-) -> str:
-    attributes = {
-        "armature": parts.mass,
-        "damping": damping,
-        "stiffness": parts.stiffness,
-        "frictionloss": limit,
-    }
-    fields = "".join(f' {name}="{value!r}"' for name, value in attributes.items() if value)
-    kind = "hinge" if parts.rotation else "slide"
-    body = "1e-9" if parts.mass else "1"
-    remark = "the fit has no mass; the body's is 1, to be replaced"
-    if parts.mass:
-        remark = "the mass, or inertia, of the fit is the armature; that of the body is negligible"
-    lines = [
-        "<!--",
-        *(f"  {note.replace('--', '-')}" for note in notes),
-        f"  {remark}",
-        "-->",
-        '<mujoco model="identified">',
-        '  <option timestep="0.0001" integrator="implicitfast" gravity="0 0 0"/>',
-        "  <worldbody>",
-        '    <body name="body">',
-        f'      <joint name="joint" type="{kind}" axis="1 0 0"{fields}/>',
-        f'      <inertial pos="0 0 0" mass="{body}" diaginertia="{body} {body} {body}"/>',
-        "    </body>",
-        "  </worldbody>",
-        *actuators,
-        "</mujoco>",
-    ]
-    return "\n".join(lines) + "\n"
+    values = {"notes": parts.notes, "damping": parts.damping, "limit": limit, "motors": ()}
+    return _rendered("mjcf.xml.j2", parts=parts, **values)
 
 
 def urdf(result: Any) -> str:
@@ -178,13 +151,7 @@ def urdf(result: Any) -> str:
     supported.pop("spring")
     parts = device(result, "urdf", supported)
     limit = sum(_limit(law, "urdf") for law in parts.laws)
-    kind = "revolute" if parts.rotation else "prismatic"
-    comment = "\n".join(f"  {note.replace('--', '-')}" for note in parts.notes)
-    mass = f'<!-- <inertial><mass value="{parts.mass!r}"/></inertial> -->\n' if parts.mass else ""
-    return (
-        f"<!--\n{comment}\n  put it into the {kind} joint\n-->\n{mass}"
-        f'<dynamics damping="{parts.damping!r}" friction="{limit!r}"/>\n'
-    )
+    return _rendered("urdf.xml.j2", parts=parts, limit=limit)
 
 
 def _limit(law: Law, form: str) -> float:
@@ -198,75 +165,27 @@ def modelica(result: Any) -> str:
     """Return a compliant component between two flanges, with the mass as a constant."""
     kinds = ("dahl", "bouc_wen", "lugre", "power_damper", *LUMPED)
     parts = device(result, "modelica", {**dict.fromkeys(kinds, ""), "mass": "a constant alone"})
-    base, s, v, out = (
-        ("Rotational", "phi_rel", "w_rel", "tau")
-        if parts.rotation
-        else ("Translational", "s_rel", "v_rel", "f")
-    )
-    declared, equations, total = [], [], [f"damping*{v}", f"stiffness*{s}"]
-    for i, law in enumerate(parts.laws, start=1):
-        declared += [f"  parameter Real {name}{i}={x!r};" for name, x in law.values.items()]
-        if law.kind != "power_damper":
-            declared.append(f'  Real z{i}(start=0, fixed=true) "state of {law.kind}";')
-            equations.append(f"  der(z{i}) = {v}*({_slope(law, i, v)});")
-        total.append(_force(law, i, v))
-    declared += [f"  constant Real {name}={getattr(parts, name)!r};" for name in LUMPED.values()]
-    lines = [
-        *(f"// {note}" for note in parts.notes),
-        'model Friction "identified friction"',
-        f"  extends Modelica.Mechanics.{base}.Interfaces.PartialCompliantWithRelativeStates;",
-        *declared,
-        "equation",
-        *equations,
-        f"  {out} = {' + '.join(total)};",
-        "end Friction;",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _slope(law: Law, i: int, v: str) -> str:
-    """Return the derivative of the force with respect to displacement, in Modelica."""
-    if law.kind == "bouc_wen" and "exponent" in law.values:
-        soft, stiff = (f"sign({r}{i})*abs({r}{i})^exponent{i}" for r in "qp")
-        rate = f"(({soft} - {stiff}) + ({soft} + {stiff})*sign({v}*z{i}))"
-        return f"sigma{i}*(1 - 0.5*{rate}*abs(z{i}/sigma{i})^exponent{i})"
-    if law.kind == "bouc_wen":
-        return f"sigma{i} - 0.5*((q{i} + p{i})*sign({v})*z{i} + (q{i} - p{i})*abs(z{i}))"
-    if law.kind == "lugre":
-        ratio = f"(1 + (static_ratio{i} - 1)*exp(-({v}/stribeck_speed{i})^2))"
-        return f"sigma{i}*(1 - sign({v})*z{i}/(f_max{i}*{ratio}))"
-    level = f"(f_max{i}*(1 + sign({v})*asymmetry{i}))" if "asymmetry" in law.values else f"f_max{i}"
-    z = f"(1 - sign({v})*z{i}/{level})"
-    return f"sigma{i}*abs({z})^alpha{i}*sign({z})"
-
-
-def _force(law: Law, i: int, v: str) -> str:
-    if law.kind == "power_damper":
-        return f"coefficient{i}*abs({v}/reference_speed{i})^exponent{i}*sign({v})"
-    if law.kind == "lugre":
-        return f"z{i} + (micro_damping{i}/sigma{i}*({_slope(law, i, v)}) + viscous{i})*{v}"
-    return f"z{i}"
+    translation = {"base": "Translational", "s": "s_rel", "v": "v_rel", "out": "f"}
+    rotation = {"base": "Rotational", "s": "phi_rel", "v": "w_rel", "out": "tau"}
+    return _rendered("friction.mo.j2", parts=parts, **(rotation if parts.rotation else translation))
 
 
 def matlab(result: Any) -> str:
     """Return a script that defines a struct: values, uncertainties, covariance, equations."""
-    lines = [f"% the fit is {result.status.value}"]
-    lines += [
-        f"% {e.kind}: {e.equation}" for e in result.model.elements if getattr(e, "equation", "")
-    ]
-    values = {p.name: p.value for p in result.model.parameters}
-    for name, p in result.params.items():
-        value = _matlab(values.get(name, p.value))
-        lines.append(f"friction.{name} = {value};  % {p.unit}".rstrip(" %"))
+    at = {p.name: p.value for p in result.model.parameters}
+    values = [(name, _matlab(at.get(name, p.value)), p.unit) for name, p in result.params.items()]
     try:
         budget, covariance = uncertain(result)
     except FitError as exc:
-        return "\n".join([*lines, f"% {exc}", ""])
-    lines += [f"friction.u.{name} = {_matlab(part.u)};" for name, part in budget.items()]
-    names = ", ".join(f"'{name}'" for name in budget)
-    rows = "; ".join(_numbers(*row) for row in covariance.tolist())
-    lines += [f"friction.names = {{{names}}};", f"friction.covariance = [{rows}];"]
-    return "\n".join(lines) + "\n"
+        return _rendered("friction.m.j2", result=result, values=values, missing=exc)
+    return _rendered(
+        "friction.m.j2",
+        result=result,
+        values=values,
+        missing=None,
+        u={name: _matlab(part.u) for name, part in budget.items()},
+        covariance=covariance.tolist(),
+    )
 
 
 def _matlab(value: float | None) -> str:
@@ -275,74 +194,21 @@ def _matlab(value: float | None) -> str:
     )
 
 
-def _numbers(*values: float) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
-def _dahl(law: Law, state: str) -> list[str]:
-    limit = repr(law["f_max"])
-    if asymmetry := law.values.get("asymmetry"):
-        limit += f" * (1.0 + (dx < 0.0 ? -1.0 : 1.0) * {asymmetry!r})"
-    step = f"friction_dahl({state}, dx, {limit}, {law['sigma']!r}, {law['alpha']!r})"
-    return [f"if (dx != 0.0) {state} = {step};", f"force += {state};"]
-
-
-def _bouc_wen(law: Law, state: str) -> list[str]:
-    if "exponent" in law.values:
-        raise ModelError("c has Bouc-Wen of exponent 1 alone; modelica has any exponent")
-    values = ", ".join(repr(law[name]) for name in ("sigma", "q", "p"))
-    return [f"{state} = friction_bouc_wen({state}, dx, {values});", f"force += {state};"]
-
-
-def _lugre(law: Law, state: str) -> list[str]:
-    f_max, sigma, ratio, speed, micro, viscous = law.values.values()
-    level = f"{f_max!r} * (1.0 + {ratio - 1.0!r} * exp(-pow({{}} / {speed!r}, 2.0)))"
-    slope = f"{sigma!r} * (1.0 - (v < 0.0 ? -1.0 : 1.0) * {state} / level)"
-    return [
-        f"level = {level.format('(0.5 * (s->v + v))')};",
-        f"if (dx != 0.0) {state} = friction_dahl({state}, dx, level, {sigma!r}, 1.0);",
-        f"level = {level.format('v')};",
-        f"force += {state} + ({micro / sigma!r} * {slope} + {viscous!r}) * v;",
-    ]
-
-
-def _slips(law: Law, state: str) -> list[str]:
-    count = len(law.values) // 2
-    first = int(state.partition("[")[2].rstrip("]"))
-    return [
-        f"force += (s->f[{first + i}] = friction_slip(s->f[{first + i}], dx, "
-        f"{law[f'stiffness_{i + 1}']!r}, {law[f'slip_{i + 1}']!r}));"
-        for i in range(count)
-    ]
-
-
-def _power(law: Law, _: str) -> list[str]:
-    c, p, speed = law["coefficient"], law["exponent"], law["reference_speed"]
-    return [f"force += v == 0.0 ? 0.0 : copysign({c!r} * pow(fabs(v) / {speed!r}, {p!r}), v);"]
-
-
-_LINES: dict[str, Callable[[Law, str], list[str]]] = {
-    "dahl": _dahl,
-    "bouc_wen": _bouc_wen,
-    "lugre": _lugre,
-    "maxwell_slip": _slips,
-    "power_damper": _power,
-}
-
-
 def c_header(result: Any) -> str:
     """Return the C header; the mass is a macro, and its force is not in the function."""
-    parts = device(result, "c", dict.fromkeys((*_LINES, *LUMPED), ""))
-    body = ["double level;"] if any(law.kind == "lugre" for law in parts.laws) else []
-    states = 0
-    kinds = set()
-    for law in parts.laws:
-        body += _LINES[law.kind](law, f"s->f[{states}]")
-        states += {"maxwell_slip": len(law.values) // 2, "power_damper": 0}.get(law.kind, 1)
-        kinds.add("dahl" if law.kind == "lugre" else law.kind)
-    lumped = ((parts.damping, "v"), (parts.stiffness, "x"))
-    body += [f"force += {size!r} * {motion};" for size, motion in lumped if size]
-    source = (files(__package__) / "friction.h.j2").read_text("utf-8")
-    template = jinja2.Template(source, trim_blocks=True, keep_trailing_newline=True)
-    text: str = template.render(parts=parts, states=max(states, 1), kinds=kinds, body=body)
-    return text
+    kinds = ("dahl", "bouc_wen", "lugre", "maxwell_slip", "power_damper", *LUMPED)
+    parts = device(result, "c", dict.fromkeys(kinds, ""))
+    if any(law.kind == "bouc_wen" and "exponent" in law.values for law in parts.laws):
+        raise ModelError("c has Bouc-Wen of exponent 1 alone; modelica has any exponent")
+    states = (
+        {"maxwell_slip": len(law.values) // 2, "power_damper": 0}.get(law.kind, 1)
+        for law in parts.laws
+    )
+    first = list(accumulate(states, initial=0))
+    return _rendered(
+        "friction.h.j2",
+        parts=parts,
+        kinds={law.kind for law in parts.laws},
+        laws=list(zip(parts.laws, first, strict=False)),
+        states=max(first[-1], 1),
+    )
