@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -209,7 +211,7 @@ class Column:
         """Return the values in a table, None if the table does not have the column."""
         if not isinstance(self.source, str):
             return self.source(data)
-        values = getattr(data, self.source, None)
+        values = attrgetter(self.source)(data) if self.source else None
         return None if values is None else np.asarray(values[(slice(None), *self.part)])
 
     def unit_of(self, motion: Motion, quantity: str) -> str:
@@ -228,15 +230,11 @@ class Column:
         return True
 
 
-def _polar(axis: int) -> Source:
-    """Return a function for the standard deviation of gain (axis 0) or phase in degrees (1)."""
-
-    def saved(data: Table) -> NDArray[Any] | None:
-        if data.covariance is None:
-            return None
-        return polar_std(data.response, data.covariance)[axis] * (180.0 / np.pi) ** axis
-
-    return saved
+def _polar_std(data: Table, axis: int) -> FloatArray | None:
+    """Return the standard deviation of gain (axis 0) or phase in degrees (1)."""
+    if data.covariance is None:
+        return None
+    return polar_std(data.response, data.covariance)[axis] * (180.0 / np.pi) ** axis
 
 
 def backbone_std(data: Table, axis: int) -> FloatArray:
@@ -298,9 +296,13 @@ def check_table(data: Table) -> None:
 
 
 _A, _F, _R = "{displacement}", "{force}", "{response}"
-_STD: dict[str, Any] = {"expected": "a standard deviation >= 0"}
 _PEAK: dict[str, Any] = {"check": positive_array, "expected": "a value > 0", "least": SMALLEST}
-_OF_RESPONSE: dict[str, Any] = {"kinds": QUANTITIES}
+_PARTS = (
+    ("real", ("real", "re", "real_part"), ()),
+    ("imag", ("imag", "im", "imaginary", "imag_part"), ("real",)),
+)
+_std = partial(Column, expected="a standard deviation >= 0")
+_response = partial(Column, unit=_R, kinds=QUANTITIES)
 _RESPONSE = (
     Column(
         ("frequency", "freq", "frequency_hz", "freq_hz"),
@@ -322,32 +324,15 @@ _RESPONSE = (
         kinds=DRIVE_KINDS,
         **_PEAK,
     ),
-    Column(("response", "frf"), _R, "response", complex_values, form="complex", **_OF_RESPONSE),
-    Column(
-        (
-            "real",
-            "re",
-            "real_part",
-            *(f"{q}_{part}" for q in QUANTITIES for part in ("re", "real")),
-        ),
-        _R,
-        lambda d: d.response.real,
-        form="rectangular",
-        **_OF_RESPONSE,
-    ),
-    Column(
-        (
-            "imag",
-            "im",
-            "imaginary",
-            "imag_part",
-            *(f"{q}_{part}" for q in QUANTITIES for part in ("im", "imag")),
-        ),
-        _R,
-        lambda d: d.response.imag,
-        form="rectangular",
-        like=("real",),
-        **_OF_RESPONSE,
+    _response(("response", "frf"), source="response", check=complex_values, form="complex"),
+    *(
+        _response(
+            (*names, *(f"{q}_{end}" for q in QUANTITIES for end in (names[1], part))),
+            source=f"response.{part}",
+            form="rectangular",
+            like=like,
+        )
+        for part, names, like in _PARTS
     ),
     Column(source="covariance", check=finite_array, shape=(2, 2)),
     *(
@@ -357,29 +342,27 @@ _RESPONSE = (
     Column(
         ("damping_ratio", "zeta"),
         "1",
-        lambda d: d.response.imag,
+        "response.imag",
         form="backbone",
         header="damping_ratio",
         expected="a damping ratio >= 0",
     ),
-    Column(
+    _std(
         ("frequency_std",),
         "Hz",
-        lambda d: backbone_std(d, 0),
+        partial(backbone_std, axis=0),
         form="backbone",
         like=("frequency",),
-        **_STD,
     ),
-    Column(
+    _std(
         ("damping_ratio_std", "zeta_std"),
         "1",
-        lambda d: backbone_std(d, 1),
+        partial(backbone_std, axis=1),
         form="backbone",
         header="damping_ratio_std",
-        **_STD,
     ),
-    Column(("gain", "magnitude", "mag"), _R, "gain", form="polar", **_OF_RESPONSE),
-    Column(("gain_db", "magnitude_db", "mag_db"), _R, **_OF_RESPONSE),
+    _response(("gain", "magnitude", "mag"), source="gain", form="polar"),
+    _response(("gain_db", "magnitude_db", "mag_db")),
     Column(
         ("phase", "phase_deg", "phase_rad"),
         "deg",
@@ -388,56 +371,52 @@ _RESPONSE = (
         header="phase_deg",
         kinds=("angle",),
     ),
-    Column(("std",), _R, like=("gain", "real", "response"), **_STD),
-    Column(("real_std",), _R, like=("real", "response"), **_STD),
-    Column(("imag_std",), _R, like=("real", "response"), **_STD),
-    Column(("gain_std",), _R, _polar(0), form="polar", like=("gain",), **_STD),
-    Column(
+    _std(("std",), _R, like=("gain", "real", "response")),
+    *(_std((f"{part}_std",), _R, like=("real", "response")) for part in ("real", "imag")),
+    _std(("gain_std",), _R, partial(_polar_std, axis=0), form="polar", like=("gain",)),
+    _std(
         ("phase_std", "phase_std_deg", "phase_std_rad"),
         "rad",
-        _polar(1),
+        partial(_polar_std, axis=1),
         form="polar",
         header="phase_std_deg",
-        **_STD,
     ),
     Column(("dof",), "", "dof", degrees_of_freedom, repeats=True, needs=("covariance",)),
     *(
-        Column(
-            (f"{level}_std",),
-            unit,
-            f"{level}_std",
-            non_negative_array,
-            needs=(level,),
-            like=(level,),
-            **_STD,
+        column
+        for name, unit in (("amplitude", _A), ("drive", _F))
+        for column in (
+            _std(
+                (f"{name}_std",),
+                unit,
+                f"{name}_std",
+                non_negative_array,
+                needs=(name,),
+                like=(name,),
+            ),
+            Column(
+                source=f"{name}_covariance",
+                check=finite_array,
+                shape=(2,),
+                needs=(f"{name}_std", "covariance"),
+            ),
+            *(
+                Column(
+                    (f"covariance_{name}_{part}",),
+                    f"({unit})*({_R})",
+                    f"{name}_covariance",
+                    part=(i,),
+                    form="rectangular",
+                )
+                for i, (part, _, _) in enumerate(_PARTS)
+            ),
         )
-        for level, unit in (("amplitude", _A), ("drive", _F))
-    ),
-    *(
-        Column(
-            source=f"{level}_covariance",
-            check=finite_array,
-            shape=(2,),
-            needs=(f"{level}_std", "covariance"),
-        )
-        for level in ("amplitude", "drive")
-    ),
-    *(
-        Column(
-            (f"covariance_{level}_{part}",),
-            f"({unit})*({_R})",
-            f"{level}_covariance",
-            part=(i,),
-            form="rectangular",
-        )
-        for level, unit in (("amplitude", _A), ("drive", _F))
-        for i, part in enumerate(("real", "imag"))
     ),
     Column(("controlled",), "", "controlled", controlled_words, repeats=True),
     Column(("harmonic",), "", "harmonic", harmonic_numbers, repeats=True),
 )
-_RECORD = tuple(
-    Column(names, unit, names[0], finite_array, kinds=kinds)
+RECORD_COLUMNS = {
+    names[0]: Column(names, unit, names[0], finite_array, kinds=kinds)
     for names, unit, kinds in (
         (("time", "t", "time_s", "timestamp"), "s", ("time",)),
         (("displacement", "disp", "position", "x"), "um", ("displacement",)),
@@ -446,13 +425,12 @@ _RECORD = tuple(
         (("force", "f", "torque"), _F, ("force",)),
         (("drive", "voltage", "current"), _F, DRIVE_KINDS),
     )
-)
+}
+"""Columns of a record, in memory and in files."""
 COLUMNS = {str(column.source): column for column in _RESPONSE if column.check}
 """Columns of a frequency response in memory."""
 RESPONSE_COLUMNS = {column.names[0]: column for column in _RESPONSE if column.names}
 """Columns of files of responses, in the order in which they are saved."""
-RECORD_COLUMNS = {column.names[0]: column for column in _RECORD}
-"""Columns of a record, in memory and in files."""
 FILE_COLUMNS = RECORD_COLUMNS | RESPONSE_COLUMNS
 
 

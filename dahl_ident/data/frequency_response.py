@@ -273,7 +273,6 @@ class FrequencyResponse(Tabular):
         return self.frequency_hz.size
 
     def _summary(self) -> tuple[str, Lines]:
-        """Return a title, and levels, ranges and units."""
         name = self.quantity.replace("_", " ")
         lines = [("frequency", extent(self.frequency_hz, "Hz"))]
         if self.levels:

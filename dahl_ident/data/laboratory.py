@@ -147,7 +147,6 @@ def _text(value: Any, name: str) -> str:
 
 
 def _instrument(entry: Any, name: str) -> Instrument:
-    """Return an instrument that is given as a text or as a table."""
     if not isinstance(entry, Mapping):
         return Instrument(_text(entry, name))
     texts = _texts(entry, _INSTRUMENT, (), name, f"{name}.")
@@ -163,7 +162,6 @@ def _instrument(entry: Any, name: str) -> Instrument:
 
 
 def _standard_uncertainty(texts: Mapping[str, str], name: str) -> float:
-    """Return the standard uncertainty of an instrument's channel."""
     channel, text = texts["channel"], texts["uncertainty"]
     if "k" not in texts:
         raise ValidationError(

@@ -223,7 +223,6 @@ class Record(Tabular):
         return draw_waveforms(self.time, self.to_frame(), kind, ax)
 
     def _summary(self) -> tuple[str, Lines]:
-        """Return a title, and sampling, ranges and units."""
         kind = self.motion_channel
         spacing = "even" if self.uniform else "uneven"
         lines = [("sampling", f"{self.sample_rate:.6g} Hz, {spacing}, {self.duration:.6g} s")]
@@ -240,7 +239,6 @@ class Record(Tabular):
 
     @property
     def _units(self) -> dict[str, str]:
-        """The units of the channels of this record."""
         units = {kind: si_unit(kind, self.motion) for kind in (*MOTION_KINDS, "force")}
         units = {"time": "s", **units, "drive": self.drive_unit}
         return {name: unit for name, unit in units.items() if getattr(self, name) is not None}
@@ -338,7 +336,6 @@ def at_even_times(record: Record) -> Record:
 
 
 def _with_warning(record: Record, message: str) -> dict[str, Any]:
-    """Warn, and return a record's provenance with the warning."""
     provenance = dict(record.provenance or {})
     warnings.warn(f"{provenance.get('file', 'the record')}: {message}", DataWarning, stacklevel=3)
     return provenance | {"warnings": [*provenance.get("warnings", ()), message]}

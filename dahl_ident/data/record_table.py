@@ -89,7 +89,6 @@ def record_size(source: RawFile, columns: ColumnMap) -> int:
 
 
 def _channels(bound: Binding) -> dict[str, RawChannel]:
-    """Return the channels by role, with exactly one of motion."""
     source = bound.source
     motions = [kind for kind in MOTION_KINDS if kind in bound.map.roles]
     if not motions:

@@ -136,7 +136,6 @@ def _with_stated(
 
 
 def _swept(sweep: str, rows: int) -> FloatArray:
-    """Return the frequencies of a sweep, one for each row."""
     match = _SWEEP.fullmatch(sweep)
     if match is None:
         raise ValidationError(
@@ -272,7 +271,6 @@ class _TableBinding(Binding):
         self.source = replace(self.source, channels=channels)
 
     def _refuse_waveforms(self) -> None:
-        """Refuse samples in time that were given in place of responses."""
         channels = self.source.channels
         roles = ("time", *MOTION_KINDS, "force")
         called = [r for r in roles if any(c.is_called(RECORD_COLUMNS[r]) for c in channels)]
@@ -412,7 +410,6 @@ class _TableBinding(Binding):
         return values * factor
 
     def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:
-        """Return the columns of errors as arguments of the constructor."""
         dof, form = self.channel("dof"), self._form(_ERROR_FORMS)
         errors: dict[str, Any] = {
             "covariance": None if form is None else self._covariance(form, quantity, response),
@@ -445,7 +442,6 @@ class _TableBinding(Binding):
         return np.stack([np.stack([rr, ri], -1), np.stack([ri, ii], -1)], -2)
 
     def _labels(self, role: str, stated: str | float | None) -> Any:
-        """Return the labels in a column, or those stated for the whole table."""
         channel = self.channel(role)
         if channel is None:
             return stated

@@ -291,7 +291,6 @@ def sine_in_each(
 
 
 def _sums(values: NDArray[Any], bounds: IntArray) -> NDArray[Any]:
-    """Return the sums between pairs of bounds."""
     return np.add.reduceat(np.append(values, 0.0), bounds)[::2] if bounds.size else values[:0]
 
 

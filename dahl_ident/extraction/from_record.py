@@ -159,7 +159,6 @@ def _where(segment: Segment) -> str:
 
 
 def _check_share(fit: SineFit, segment: Segment, settings: Settings, lost: FloatArray) -> None:
-    """Refuse a segment that is not one sine."""
     shares = fundamental_share(fit, segment, lost)
     for name, share in zip((settings.motion_channel, "force"), shares, strict=True):
         if share < settings.min_share:
@@ -182,7 +181,6 @@ def _settling_periods(phasors: Phasors, cycles: int) -> int:
 
 
 def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
-    """Return the rows of a segment with their quality and verdicts."""
     distorted = phasors.distorted
     response, joint, dof = phasors.rows(distorted)
     no_noise = {k: LineNoise(np.zeros_like(n.lines), n.dof) for k, n in phasors.noise.items()}
@@ -410,11 +408,9 @@ def _table(
     labels: dict[str, Any],
     provenance: dict[str, Any],
 ) -> FrequencyResponse:
-    """Return one row for each harmonic of each point."""
     rows = [len(point.harmonic) for point in points]
 
     def per_row(name: str) -> Any:
-        """Return a field or a quality of the points, one value per row."""
         values = [getattr(p, name) if hasattr(p, name) else p.quality[name] for p in points]
         pairs = zip(values, rows, strict=True)
         return np.concatenate([v if np.ndim(v) else np.full(n, v) for v, n in pairs])

@@ -215,7 +215,6 @@ def _steady_part(
 
 
 def _highest_by_chance(share: float, dof: int) -> float:
-    """Return the value that F(2, dof) exceeds with this probability."""
     return float(0.5 * dof * (share ** (-2.0 / dof) - 1.0))
 
 

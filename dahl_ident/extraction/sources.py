@@ -214,7 +214,6 @@ def extract_all(
 def _extracted_with_warnings(
     task: FileTask, settings: Settings
 ) -> tuple[FrequencyResponse, list[str]]:
-    """Return the points of a task and its warnings, for the main process to show."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         data = _extracted(task, settings)

@@ -331,7 +331,6 @@ def open_source(
 
 
 def _parsed(file: File, sheet: str | None) -> RawFile:
-    """Pass a file to its reader."""
     form = FORMATS[file.format]
     module, _, name = form.reader.partition(".")
     read = getattr(import_module(f"{__name__}.{module}"), name)  # each imported when first used
@@ -352,7 +351,6 @@ def _parsed(file: File, sheet: str | None) -> RawFile:
 
 
 def _options_given(**options: Any) -> dict[str, Any]:
-    """Return the options that are not at their defaults, as JSON data."""
     return {
         name: plain_data(value)
         for name, value in options.items()

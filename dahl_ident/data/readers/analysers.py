@@ -116,7 +116,6 @@ def read_uff(file: File) -> RawFile:
 
 
 def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
-    """Return the data sets of a file; an error names a damaged one."""
     sets: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         # pyuff reads only files with a name, which standard input lacks, and prints groups
@@ -250,13 +249,11 @@ class _Sdf:
         return self.data[at : at + size]
 
     def fields(self, record: bytes, kind: int) -> SimpleNamespace:
-        """Return the fields of a record by their names."""
         fields = _FIELDS[kind].items()
         values = {n: np.ndarray((), f, record, at).tolist() for n, (f, at) in fields}
         return SimpleNamespace(**values)
 
     def records(self, kind: int) -> Iterator[bytes]:
-        """Yield all records of a kind: results, vectors or channels."""
         i = (_DATA, _VECTOR, _CHANNEL).index(kind)
         count, at = self.head.counts[i], self.head.places[i]
         if not 0 <= count <= MOST_CHANNELS:
@@ -322,7 +319,6 @@ class _Sdf:
         return result
 
     def axis(self, result: SimpleNamespace) -> RawChannel:
-        """Return the frequencies or times of a result."""
         role = {_FREQUENCY: "frequency", _TIME: "time"}.get(result.domain)
         self.file.refuse_above_limit(8 * result.points, "one axis")
         n = np.arange(result.points)
@@ -390,6 +386,5 @@ def _text(letters: bytes) -> str:
 
 
 def _unit(letters: bytes) -> str | None:
-    """Return a unit from its label."""
     label = _text(letters)
     return _UNITS.get(label.casefold(), label) or None

@@ -58,7 +58,6 @@ def tree_source(
 
 
 def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:
-    """Yield an array as one channel, or a matrix as several."""
     short = re.split(r"[./]", path)[-1]
     array = value if isinstance(value, Stored) else np.asarray(value)
     shape = tuple(n for n in array.shape if n != 1)
@@ -247,7 +246,6 @@ class _Tree:
                 yield name, item
 
     def all_items(self, group: Any, depth: int) -> Iterator[tuple[str, Any]]:
-        """Yield every object below a group."""
         for name, item in self.members(group, depth):
             yield name, item
             if isinstance(item, self.h5py.Group):
@@ -282,7 +280,6 @@ class _Tree:
     def stored(
         self, item: Any, path: str, dtype: Any, convert: Any, *, transposed: bool = False
     ) -> Stored:
-        """Return an array that is read when needed."""
 
         def read(rows: slice) -> NDArray[Any]:
             self.refuse(item, path)

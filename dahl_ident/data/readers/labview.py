@@ -157,7 +157,6 @@ def _labelled(prefix: str, label: str, values: Any, unit: str | None) -> RawChan
 
 
 def _time_channels(axes: Sequence[Any], prefix: str) -> Iterator[RawChannel]:
-    """Yield the different time axes of a group."""
     for i, time in enumerate(axes):
         name = "time" if len(axes) == 1 else f"time {i + 1}"
         yield RawChannel(prefix + name, time, "s", "time", name)
@@ -201,7 +200,6 @@ class _Lvm:
         self.single = (settings.get("Multi_Headings") or ["Yes"])[0].strip().casefold() == "no"
 
     def header(self) -> Lines:
-        """Remove and return the lines of a header."""
         for i, (_, line) in enumerate(self.lines):
             if line.strip() == _END:
                 head, self.lines = self.lines[:i], self.lines[i + 1 :]
@@ -209,12 +207,10 @@ class _Lvm:
         raise ValueError(f"a header without {_END}")
 
     def entries(self, head: Lines) -> dict[str, list[str]]:
-        """Return the values of a header by their keys."""
         cells = (line.split(self.separator) for _, line in head)
         return {key.strip(): values for key, *values in cells}
 
     def segment(self) -> _LvmBlock:
-        """Remove and return a segment: its header, labels and numbers."""
         header = self.entries(self.header())
         lines = list(itertools.dropwhile(lambda pair: not pair[1].strip(), self.lines))
         if not lines:
@@ -253,7 +249,6 @@ class _Lvm:
         return segment
 
     def check_samples(self, segment: _LvmBlock) -> None:
-        """Refuse a segment with fewer or more samples than its header states."""
         rows = len(segment.data)
         stated = [value.strip() for value in segment.header.get("Samples", []) if value.strip()]
         for value in stated:
@@ -279,7 +274,6 @@ class _LvmBlock(NamedTuple):
     multi: bool
 
     def channels(self, prefix: str) -> Iterator[RawChannel]:
-        """Yield the channels, and time from the x columns or their stated step."""
         table = list(zip(self.labels, self.data.T, strict=True))
         named = [pair for pair in table if pair[0] != "X_Value"]
         units = self.header.get("Y_Unit_Label", [])
@@ -310,7 +304,6 @@ class _LvmBlock(NamedTuple):
                 )
 
     def floats(self, key: str) -> list[float]:
-        """Return the numbers in an entry of the header."""
         numbers = []
         for value in self.header.get(key, []):
             with contextlib.suppress(ValueError):

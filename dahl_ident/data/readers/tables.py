@@ -75,7 +75,6 @@ def read_workbook(file: File, sheet: str | None = None) -> RawFile:
 
 
 def _cells(file: File) -> dict[str, list[list[Any]]]:
-    """Return the cells of every sheet, read in a separate process."""
     damaged = None
     with contextlib.suppress(*ZIP_ERRORS), zipfile.ZipFile(file.stream()) as archive:
         damaged = archive.testzip()
@@ -282,7 +281,6 @@ def _is_list_of(kind: type, content: Any) -> bool:
 
 
 def _transposed(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
-    """Return the columns of a list of rows."""
     if not isinstance(labels, list) or any(
         not isinstance(row, list) or len(row) != len(labels) for row in rows
     ):
@@ -350,7 +348,6 @@ def _array(values: Any, what: str) -> NDArray[Any]:
 
 
 def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[RawChannel]:
-    """Yield the channels of SDyPy and their common time."""
     labels = Counter(str(c["name"]) for c in channels)
     repeated = [label for label, count in labels.items() if count > 1]
     if repeated:

@@ -187,7 +187,6 @@ def _split(line: str, delimiter: str | None) -> list[str]:
 
 
 def _layout(lines: list[str], name: str) -> _Layout:
-    """Find dialect and start of the numbers, and read the header above them."""
     skipped = [_skipped(text) for text in lines]
     texts = [text for text, skip in zip(lines, skipped, strict=True) if not skip]
     for dialects in (_DIALECTS, _LAST_DIALECTS):
@@ -274,7 +273,6 @@ def _metadata(lines: Iterable[str], name: str) -> Mapping[str, Any]:
 
 
 def _skipped(text: str) -> bool:
-    """Return whether a line is blank or a comment."""
     return not text.strip() or _COMMENT.match(text) is not None
 
 
