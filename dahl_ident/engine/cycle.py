@@ -14,7 +14,7 @@ from numba import boolean, complex128, float64, int64, njit, types
 from dahl_ident.engine.collocation import SHORTEST, STAGES
 from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR, compiled, eliminate
 from dahl_ident.engine.integrate import Asked, Scratch, advance
-from dahl_ident.engine.radau import Signal, at_unit_velocity, layout, put_parameters, restart
+from dahl_ident.engine.radau import LAYOUT, Signal, at_unit_velocity, put_parameters, restart
 
 _SHOTS = 40  # of shooting; five are typical
 # Changes of the initial states over the largest states:
@@ -55,7 +55,7 @@ def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
 @njit(
     types.Tuple((NUMBERS, complex128[:, :, ::1], TABLE, float64[:, :, ::1]))(
         FUNCTION,
-        NUMBERS,
+        LAYOUT,
         NUMBERS,
         NUMBERS,
         boolean,
@@ -73,7 +73,7 @@ def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
 )
 def cycles(
     f,
-    sizes,
+    at,
     solved,
     followers,
     odd,
@@ -93,12 +93,11 @@ def cycles(
     states; the map of a cycle, or of half a cycle with its sign if the system is odd. The first
     `initial_cycles` iterations are cycles without Newton's method.
     """
-    n, held, rows = sizes[0], sizes[3], amplitudes.size
+    n, held, rows = at.n, at.held, amplitudes.size
     begin = 2 if held else 0
     free = n - begin
     sign = -1.0 if odd else 1.0
     q = free + 1 + chosen.size
-    at = layout(sizes, q, 0)
     w = np.zeros(at.length)
     size = STAGES * n
     block, sides = np.zeros((size, size)), np.zeros((size, max(1, q)))

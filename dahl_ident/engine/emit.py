@@ -19,44 +19,15 @@ _BINARY = {"ADD": "fadd", "SUB": "fsub", "MUL": "fmul", "DIV": "fdiv"}
 _COMPARISONS = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
 _INTRINSIC = ("sqrt", "exp", "log", "sin", "cos", "fabs", "floor", "ceil")
 _LIBRARY = (
-    "tan",
-    "asin",
-    "acos",
-    "atan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "asinh",
-    "acosh",
-    "atanh",
-    "erf",
-    "expm1",
-    "log1p",
-    "atan2",
-    "hypot",
-    "copysign",
-    "fmod",
+    *("tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+    *("erf", "expm1", "log1p", "atan2", "hypot", "copysign", "fmod"),
 )
 _NAMES = {
     code: name
     for name in (
-        *_BINARY,
-        *_COMPARISONS,
-        *(n.upper() for n in (*_INTRINSIC, *_LIBRARY)),
-        "ASSIGN",
-        "NEG",
-        "SQ",
-        "TWICE",
-        "INV",
-        "FMIN",
-        "FMAX",
-        "SIGN",
-        "NOT",
-        "AND",
-        "OR",
-        "IF_ELSE_ZERO",
-        "POW",
-        "CONSTPOW",
+        *(*_BINARY, *_COMPARISONS, *(n.upper() for n in (*_INTRINSIC, *_LIBRARY))),
+        *("ASSIGN", "NEG", "SQ", "TWICE", "INV", "FMIN", "FMAX", "SIGN"),
+        *("NOT", "AND", "OR", "IF_ELSE_ZERO", "POW", "CONSTPOW"),
     )
     if (code := getattr(ca, f"OP_{name}", None)) is not None
 }

@@ -116,13 +116,16 @@ def settled(
     `starts`, such as those of nearby parameters, or from rest. A number of `cycles` precede
     Newton's method. The tolerance of a step's error is divided by `finer`.
     """
+    from dahl_ident.engine.radau import layout  # numba is slow to import
+
     if cycles is None:
         cycles = 0 if starts is not None else 1 if system.held else _CYCLES
     first = np.zeros((amplitude.size, system.order)) if starts is None else starts
+    columns = system.order - 2 * system.held + 1 + len(chosen)
     found, result, first, maps = _run(
         kernels("cycle").cycles,
         system.function,
-        system.sizes,
+        layout(system.sizes, columns, 0),
         system.solved,
         system.followers,
         system.odd,
@@ -191,10 +194,13 @@ def march(
     `knots`, (m + 1,). The motion starts from the states `first` at the first of the `samples`.
     FitError is raised if it grows beyond all bounds, or has no derivatives that are wanted.
     """
+    from dahl_ident.engine.radau import layout  # numba is slow to import
+
+    columns = system.order + 1 + len(chosen) if derivatives else 0
     found, output, by, states, last = _run(
         kernels("samples").march,
         system.function,
-        system.sizes,
+        layout(system.sizes, columns, len(coefficients) - 1),
         system.solved,
         system.followers,
         _numbers(knots),

@@ -23,6 +23,8 @@ from __future__ import annotations
 from collections import namedtuple
 
 import numpy as np
+from numba import types
+from numpy.typing import NDArray
 
 from dahl_ident.engine.collocation import (
     CHECKED,
@@ -60,67 +62,39 @@ Layout = namedtuple(
     "stiff interval length",
 )
 """Numbers of states, switches, parameters; then the index in `w` at which each quantity begins."""
+LAYOUT = types.NamedUniTuple(types.int64, len(Layout._fields), Layout)
 
 
-@compiled
-def layout(sizes, columns, degree):
-    """Return the layout for some columns of sensitivities and degree of the signal."""
-    n, k, P = sizes[0], sizes[1], sizes[2]
+def layout(sizes: NDArray[np.int64], columns: int, degree: int) -> Layout:
+    """Return the layout for the sizes of a system, columns of sensitivities, degree of a signal."""
+    n, k, P, held, rated, prepared = sizes.tolist()
     m, s = n + 1 + k, STAGES
-    outputs = 3 + n + k + P + sizes[5]  # the function's inputs come first
-    values = outputs + m * (2 + n + P)  # rates, output and switching functions at stages, (s, m)
-    rates = values + s * m  # at the beginning of a step, (n)
-    state_slopes = rates + n  # d values / d states, (s, m, n)
-    drive_slopes = state_slopes + s * m * n  # d values / d drive and parameters, (s, m, 1 + P)
-    solved_slopes = drive_slopes + s * m * (1 + P)  # d solved rates / d solved states, (s, n, n)
-    coupling = solved_slopes + s * n * n  # d solved rates / d x, followers included, (s, n)
-    follow = coupling + s * n  # d followers / d x, (n)
-    follow_slopes = follow + n  # their derivatives with respect to drive and parameters
-    stages = follow_slopes + n * (1 + P)  # changes of the states up to the stages, (s, n)
-    last = stages + s * n  # those of the last step, (s, n)
-    changes = last + s * n  # changes of the sensitivities up to the stages, (s, n, columns)
-    scale = changes + s * n * columns  # largest size of each of the values, (m)
-    sides = scale + m  # direction of the motion, then sides of the switches, (1 + k)
-    before = sides + 1 + k  # velocity and switching functions at the beginning, (1 + k)
-    output = before + 1 + k  # output at the beginning
-    weights = output + 1  # weights of the stages in a polynomial's value, (s)
-    jump = weights + s  # rates before an event, (n)
-    late = jump + n  # derivatives of the time of an event, (columns)
-    signal = late + columns  # value, rate and second derivative at the stages, (s, 3)
-    stiff = signal + 3 * s  # 1 where fixed-point iterations did not converge, until an event
-    interval = stiff + 1  # the signal's: number, begin, end, 1 where pinned, coefficients
-    length = interval + 4 + degree + 1
-    return Layout(
-        n,
-        k,
-        P,
-        sizes[3],
-        sizes[4],
-        degree,
-        outputs,
-        values,
-        rates,
-        state_slopes,
-        drive_slopes,
-        solved_slopes,
-        coupling,
-        follow,
-        follow_slopes,
-        stages,
-        last,
-        changes,
-        scale,
-        sides,
-        before,
-        output,
-        weights,
-        jump,
-        late,
-        signal,
-        stiff,
-        interval,
-        length,
+    counts = (
+        3 + n + k + P + prepared,  # inputs of the function
+        m * (2 + n + P),  # its outputs
+        s * m,  # values: rates, output and switching functions at stages, (s, m)
+        n,  # rates at the beginning
+        s * m * n,  # d values / d states, (s, m, n)
+        s * m * (1 + P),  # d values / d drive and parameters, (s, m, 1 + P)
+        s * n * n,  # d solved rates / d solved states, (s, n, n)
+        s * n,  # coupling: d solved rates / d x, followers included, (s, n)
+        n,  # d followers / d x
+        n * (1 + P),  # their derivatives with respect to drive and parameters
+        s * n,  # changes of the states up to the stages, (s, n)
+        s * n,  # those of the last step
+        s * n * columns,  # changes of the sensitivities up to the stages, (s, n, columns)
+        m,  # scale: largest size of each of the values
+        1 + k,  # sides: direction of the motion, then sides of the switches
+        1 + k,  # velocity and switching functions at the beginning
+        1,  # output at the beginning
+        s,  # weights of the stages in a polynomial's value
+        n,  # jump: rates before an event
+        columns,  # derivatives of the time of an event
+        3 * s,  # value, rate and second derivative of the signal at the stages, (s, 3)
+        1,  # 1 where fixed-point iterations did not converge, until an event
+        4 + degree + 1,  # the signal's interval: number, begin, end, 1 if pinned, coefficients
     )
+    return Layout(n, k, P, held, rated, degree, *np.cumsum(counts).tolist())
 
 
 @compiled

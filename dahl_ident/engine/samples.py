@@ -8,13 +8,13 @@ from numba import float64, int64, njit, types
 from dahl_ident.engine.collocation import STAGES
 from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR
 from dahl_ident.engine.integrate import Asked, Scratch, advance
-from dahl_ident.engine.radau import Signal, layout, put_parameters, restart
+from dahl_ident.engine.radau import LAYOUT, Signal, put_parameters, restart
 
 
 @njit(
     types.Tuple((int64, VECTOR, TABLE, TABLE, TABLE))(
         FUNCTION,
-        NUMBERS,
+        LAYOUT,
         NUMBERS,
         NUMBERS,
         VECTOR,
@@ -31,7 +31,7 @@ from dahl_ident.engine.radau import Signal, layout, put_parameters, restart
 )
 def march(
     f,
-    sizes,
+    at,
     solved,
     followers,
     knots,
@@ -48,9 +48,8 @@ def march(
     The signal is polynomials between knots. If `derivatives` is 1, these are with respect to the
     initial states, the time by which a drive comes earlier, and the parameters `chosen`.
     """
-    n, N = sizes[0], samples.size
+    n, N = at.n, samples.size
     q = n + 1 + chosen.size if derivatives else 0
-    at = layout(sizes, q, coefficients.shape[0] - 1)
     w = np.zeros(at.length)
     matrix, columns = np.zeros((STAGES * n, STAGES * n)), np.zeros((STAGES * n, max(1, q)))
     restart(w, at)
