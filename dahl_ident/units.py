@@ -79,26 +79,9 @@ _MARKER = re.compile(
 )
 _DECIBEL = re.compile(r"^\s*dB\b(?:\s*re\.?\s*(?:1(?![\d./]))?)?\s*", re.I)
 # Spellings of laboratories that pint does not know, or interprets differently.
-_SPELLINGS = {
-    "sec": "s",
-    "Sec": "s",
-    "Deg": "deg",
-    "DEG": "deg",
-    "Rad": "rad",
-    "RAD": "rad",
-    "HZ": "Hz",
-    "hz": "Hz",
-    "Nm": "N*m",
-    "kNm": "kN*m",
-    "mNm": "mN*m",
-    "Nmm": "N*mm",
-    "Ns": "N*s",
-    "Nms": "N*m*s",
-    "mil": "thou",
-    "mils": "thou",
-    "VDC": "V",
-    "VAC": "V",
-}
+_SPELLINGS = {"sec": "s", "deg": "deg", "rad": "rad", "hz": "Hz", "mil": "thou", "mils": "thou"}
+_SPELLINGS |= {"vdc": "V", "vac": "V"}
+_JOINED = re.compile(r"\b([kmu]?N)(m?[ms])(?![A-Za-z])")  # such as kNm, Nmm and Ns
 _PREFIXES = {-9: "n", -6: "\u00b5", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 _AMBIGUOUS = {"grad": "a degree in German and a gon elsewhere; write deg or gon"}
 # Units of nearly every file, read without pint, which takes most of a second to load.
@@ -276,7 +259,8 @@ def _normalised(text: str, written: str) -> str:
     out = re.sub(r"(?<=[A-Za-z°])[-.](?=[A-Za-z])", "*", out)
     out = re.sub(r"(?<=[A-Za-z])(-?\d)", r"^\1", out)
     out = re.sub(r"[A-Z][a-z]{3,}", lambda m: m[0].lower(), out)  # Newtons, Volts
-    out = re.sub(r"[A-Za-z]+", lambda m: _SPELLINGS.get(m[0], m[0]), out)
+    out = re.sub(r"[A-Za-z]+", lambda m: _SPELLINGS.get(m[0].casefold(), m[0]), out)
+    out = _JOINED.sub(r"\1*\2", out)
     if not out or len(out) > _LONGEST_UNIT or _TOKEN.sub("", out):
         raise UnitError(
             f"[{written}] is not a unit; expected one such as [m], [um rms], [kN], [m/s^2] or "

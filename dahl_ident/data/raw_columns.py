@@ -35,20 +35,8 @@ _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
 _SYMBOL = "(?:[numkM]?(?:Nm|N|m|rad|V|A|Hz|s)|s2|kg|lbf|(?i:hz|deg|rad|s))"
 # no unit is split off a name of one letter
 _UNIT_AT_END = re.compile(rf"(.*?[^\W_]{{2}})[\s._-]+({_SYMBOL}(?:_per_{_SYMBOL})*)")
-_CODES = (
-    999.0,
-    9999.0,
-    99999.0,
-    999999.0,
-    999.9,
-    9999.9,
-    999.99,
-    9999.99,
-    32767.0,
-    32768.0,
-    2147483647.0,
-    2147483648.0,  # limits of integers
-)
+_CODES = {10.0**n - 1.0 for n in (3, 4, 5, 6)} | {999.9, 9999.9, 999.99, 9999.99}
+_CODES |= {limit for bits in (15, 31) for limit in (2.0**bits - 1.0, 2.0**bits)}  # of integers
 """Marks of missing values in files of data loggers, with either sign."""
 
 _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from typing import Any, Literal
 
@@ -19,8 +18,7 @@ from dahl_ident.errors import DataError, UnitError, ValidationError, argument
 from dahl_ident.units import MOTION_KINDS, counted, si_unit
 
 _STAMP = re.compile(
-    r"\s*(?P<stamp>(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)"
-    r"(?:Z|(?P<sign>[-+])(?P<hours>\d\d):?(?P<minutes>\d\d))?\s*"
+    r"(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?(?:Z|[-+]\d\d:?\d\d)?"
 )
 
 
@@ -150,28 +148,24 @@ def _samples(bound: Binding, role: str, channel: RawChannel) -> FloatArray:
 
 def is_stamped(channel: RawChannel) -> bool:
     """Return whether a channel holds time stamps, which need no unit."""
-    return channel.kind == "U" and _STAMP.match(str(channel.values.flat[0])) is not None
+    return channel.kind == "U" and _STAMP.fullmatch(channel.values.flat[0].strip()) is not None
 
 
 def _seconds(bound: Binding, channel: RawChannel) -> FloatArray:
     """Return the time since the first stamp: ISO 8601, or times of one day."""
-    nanoseconds = np.empty(channel.size, dtype=np.int64)
-    for i, cell in enumerate(channel.values.flat):
-        moment: Any = np.datetime64("NaT")
-        if (match := _STAMP.fullmatch(str(cell))) is not None:
-            stamp = match["stamp"] if match["date"] else f"1970-01-01T{match['stamp']}"
-            with contextlib.suppress(ValueError):
-                moment = np.datetime64(stamp.replace(" ", "T").replace(",", "."), "ns")
-        if match is None or np.isnat(moment):
-            raise DataError(
-                f"{bound.source.where(channel, i)}: {str(cell)[:40]!r} is not a time stamp such as "
-                "2024-03-31T12:00:00.5 or 12:00:00.5"
-            )
-        nanoseconds[i] = moment.astype(np.int64)
-        if match["sign"]:  # of the offset of local time from UTC
-            offset = (60 * int(match["hours"]) + int(match["minutes"])) * 60_000_000_000
-            nanoseconds[i] -= -offset if match["sign"] == "-" else offset
-    return np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
+    import pandas as pd
+
+    cells = [cell.strip() for cell in channel.values.tolist()]
+    matches = [_STAMP.fullmatch(cell) for cell in cells]
+    days = ["" if m is None or m["date"] else "1970-01-01T" for m in matches]
+    stamps = [d + m[0].replace(",", ".") if m else "" for d, m in zip(days, matches, strict=True)]
+    moments = pd.to_datetime(stamps, format="ISO8601", utc=True, errors="coerce").as_unit("ns")
+    for i in np.flatnonzero(moments.isna())[:1]:
+        raise DataError(
+            f"{bound.source.where(channel, i)}: {cells[i][:40]!r} is not a time stamp such as "
+            "2024-03-31T12:00:00.5 or 12:00:00.5"
+        )
+    return np.asarray((moments.asi8 - moments.asi8[0]) * 1e-9)
 
 
 def _increasing(bound: Binding, channel: RawChannel, time: FloatArray) -> FloatArray:

@@ -37,27 +37,10 @@ _LINE = re.compile(
     rf"(?:[:=;,\t]\s*|\s)[\"']?{_NUMBER}(?:[\"']?\s*[;,\t]?\s*[\[(\"']?(?P<unit>{_UNIT}))?",
     re.IGNORECASE,
 )
-_SUBJECTS = {
-    "drive",
-    "driving",
-    "excitation",
-    "source",
-    "force",
-    "control",
-    "target",
-    "reference",
-    "test",
-    "shaker",
-    "input",
-    "sine",
-    "load",
-    "torque",
-    "displacement",
-    "velocity",
-    "acceleration",
-    "response",
-    "nominal",
-}
+_SUBJECT = re.compile(
+    "drive|driving|excitation|source|force|control|target|reference|test|shaker|input|sine|load|"
+    "torque|displacement|velocity|acceleration|response|nominal|level|amplitude"
+)
 _SIZES = {"level", "amplitude"}
 
 
@@ -286,7 +269,8 @@ def stated_levels(lines: Iterable[str]) -> dict[str, str]:
         if match is None:
             continue
         words = set(re.split(r"[\s_.-]+", match["key"].casefold())) - {""}
-        if not words <= _SUBJECTS | _SIZES or not (words & _SIZES or words == {"drive"}):
+        sized = words & _SIZES or words == {"drive"}
+        if not sized or not all(map(_SUBJECT.fullmatch, words)):
             continue
         unit = match["bracketed"] or match["unit"] or ""
         text = f"{match['value'].replace(',', '.')} {unit.strip()}"

@@ -215,9 +215,8 @@ def _refuse_fatal(file: File, h5py: Any) -> None:
                         _ = item[()] if item.nbytes < remaining else (item[:1], item[-1:])
                     remaining -= min(item.nbytes, remaining)
 
-    error = in_child_process(
-        visit, seconds=_CHECK_SECONDS + file.length // _CHECK_BYTES_PER_SECOND
-    ).error
+    seconds = _CHECK_SECONDS + file.length // _CHECK_BYTES_PER_SECOND
+    _, error = in_child_process(visit, seconds=seconds)
     if error:
         raise ValueError(f"{error} on its structure")
 

@@ -37,17 +37,6 @@ MOST_CHANNELS = 5000
 """Largest number of columns, arrays or data sets in one file; measured files have some tens."""
 DEEPEST = 32
 """Deepest nesting of groups, structs or lists."""
-ZIP_ERRORS = (
-    zipfile.BadZipFile,
-    OSError,
-    EOFError,
-    ValueError,
-    KeyError,
-    zlib.error,
-    NotImplementedError,
-    RuntimeError,
-)
-"""What Python's zipfile raises on damaged archives."""
 _UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; parsed, they take ten times as much
 _OBJECT_BYTES = 40  # least memory of each line or list into which a text is split
 _UNPACKED_RATIO = 8  # text and sampled waveforms rarely compress better
@@ -270,9 +259,9 @@ def _archive(file: File, suffix: str) -> str:
                 return "excel"
             if "mimetype" in names and b"opendocument.spreadsheet" in archive.read("mimetype"):
                 return "ods"
-    except DataError:  # which ZIP_ERRORS would catch as a ValueError
+    except DataError:
         raise
-    except ZIP_ERRORS:  # its reader will report the damage
+    except Exception:  # a damaged archive, which its reader will report
         return {".ods": "ods", ".npz": "npz"}.get(suffix, "excel" if "xls" in suffix else "zip")
     if names and all(name.endswith(".npy") for name in names):
         return "npz"
@@ -301,22 +290,15 @@ def utf8(data: bytes) -> bytes:
     return data
 
 
-class Answer(NamedTuple):
-    """The result of the work, or the reason why there is none."""
-
-    value: Any = None
-    error: str = ""
-
-
 def in_child_process(
     work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = None
-) -> Answer:
-    """Return a function's result, computed in a child process with limits of time and memory.
+) -> tuple[Any, str]:
+    """Return a function's result, or None and the reason why there is none, of a child process.
 
-    `bytes_at_most` are in addition to the memory that is already in use.
+    The time is limited, and the memory to `bytes_at_most` in addition to what is in use.
     """
     if not hasattr(os, "fork"):
-        return Answer(work())
+        return work(), ""
     reading, writing = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the child does not use other threads
@@ -324,9 +306,9 @@ def in_child_process(
     if process == 0:  # pragma: no cover
         try:
             _limit(seconds, bytes_at_most)
-            answer = Answer(work())
+            answer = work(), ""
         except BaseException as exc:
-            answer = Answer(error=str(exc) or type(exc).__name__)
+            answer = None, str(exc) or type(exc).__name__
         with contextlib.suppress(BaseException), os.fdopen(writing, "wb") as pipe:
             pickle.dump(answer, pipe)
         os._exit(0)
@@ -339,10 +321,9 @@ def in_child_process(
     _, status = os.waitpid(process, 0)
     if status or not content:
         hung = os.waitstatus_to_exitcode(status) in (-signal.SIGXCPU, -signal.SIGKILL)
-        return Answer(error=f"its reader {'hangs' if hung else 'fails'}")
-    answer = pickle.loads(content)
-    assert isinstance(answer, Answer)
-    return answer
+        return None, f"its reader {'hangs' if hung else 'fails'}"
+    value, error = pickle.loads(content)
+    return value, error
 
 
 def _limit(seconds: int, bytes_at_most: int | None) -> None:  # pragma: no cover

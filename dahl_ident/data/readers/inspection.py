@@ -23,21 +23,10 @@ _RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # names o
 _FEW_GAPS = 5  # gaps that are listed singly; otherwise their number, the longest and the first
 # The proposed columns; those that all have the unit of the gain are not recognised by unit.
 _RECORD = RECORD_COLUMNS | {"drive": replace(RECORD_COLUMNS["drive"], kinds=("voltage", "current"))}
-_RESPONSE = {
-    role: RESPONSE_COLUMNS[role] if by_unit else replace(RESPONSE_COLUMNS[role], kinds=())
-    for role, by_unit in (
-        ("frequency", True),
-        ("amplitude", True),
-        ("drive", True),
-        ("response", False),
-        ("real", False),
-        ("imag", False),
-        ("gain", True),
-        ("gain_db", False),
-        ("phase", True),
-        ("level", False),
-    )
-}
+_BY_UNIT = ("frequency", "amplitude", "drive", "gain", "phase")
+_BY_NAME = ("response", "real", "imag", "gain_db", "level")
+_RESPONSE = {role: RESPONSE_COLUMNS[role] for role in _BY_UNIT}
+_RESPONSE |= {role: replace(RESPONSE_COLUMNS[role], kinds=()) for role in _BY_NAME}
 _FREQUENCY = RESPONSE_COLUMNS["frequency"]
 _F_TOO = replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))
 

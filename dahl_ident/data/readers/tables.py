@@ -33,7 +33,7 @@ from dahl_ident.data.raw_columns import (
     split_header,
     words,
 )
-from dahl_ident.data.readers.file import ZIP_ERRORS, File, in_child_process, refuse_many, utf8
+from dahl_ident.data.readers.file import File, in_child_process, refuse_many, utf8
 from dahl_ident.data.rows import stated_levels
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
@@ -76,7 +76,7 @@ def read_workbook(file: File, sheet: str | None = None) -> RawFile:
 
 def _cells(file: File) -> dict[str, list[list[Any]]]:
     damaged = None
-    with contextlib.suppress(*ZIP_ERRORS), zipfile.ZipFile(file.stream()) as archive:
+    with contextlib.suppress(Exception), zipfile.ZipFile(file.stream()) as archive:
         damaged = archive.testzip()
     if damaged is not None:
         raise ValueError(f"the check sum of {damaged} differs")
