@@ -194,7 +194,7 @@ def loop(name: str, rng: np.random.Generator) -> Case:
 
     oracle = Oracle([drawn.hand], displacement, True, sizes=_sizes(drawn))
     _, c, _ = fixed_point(oracle, found.starts[0, 2:], found.maps[0, 2:, 2:], omega, system.odd)
-    error = _share(c, found.coefficients[0])
+    error = _share(c, found.harmonics[0])
     if name not in ("Iwan", "Power damper"):  # the law itself, where it is the one by hand
         values, at = [np.asarray(v) for v in all_values(drawn)], np.asarray(amplitude)
         law = [drawn.element.stiffness(values, at, np.asarray(omega), k) for k in HARMONICS]
@@ -226,7 +226,7 @@ def any_amplitude(name: str, rng: np.random.Generator) -> Case:
     seconds = time.process_time() - start
     if not found.found[0]:
         return Case(np.inf, note)
-    error = _share(expected, found.coefficients[0])
+    error = _share(expected, found.harmonics[0])
     if name != "Iwan":  # whose own are those of infinitely many elements
         own = drawn.element.stiffness(list(values[0]), at, one, np.array(HARMONICS))
         error = max(error, _share(expected, amplitude * own))
@@ -263,7 +263,7 @@ def periodic(name: str, rng: np.random.Generator) -> Case:
         _sizes(drawn, size, size * omega),
     )  # fmt: skip
     _, harmonics, _ = fixed_point(oracle, found.starts[0], found.maps[0], omega, system.odd)
-    return Case(_share(harmonics, found.coefficients[0]), note, seconds)
+    return Case(_share(harmonics, found.harmonics[0]), note, seconds)
 
 
 def history(name: str, rng: np.random.Generator) -> Case:

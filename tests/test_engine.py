@@ -85,7 +85,7 @@ def test_dahl_loops_are_the_closed_forms(beta):
                      harmonics=(1,), chosen=(0, 1))  # fmt: skip
     N = complex(law.describing_function(A))
     assert result.found[0]
-    assert abs(result.coefficients[0, 0] / A - N) < 1e-9 * abs(N)
+    assert abs(result.harmonics[0, 0] / A - N) < 1e-9 * abs(N)
     slopes = law.gradient(A)
     for k, name in enumerate(("f_max", "sigma")):
         value = complex(slopes[name]) * (2.0, 500.0)[k]
@@ -231,12 +231,12 @@ def test_bilinear_slopes_by_comparisons():
     """The tip at A = 0.006 by hand: 1.2 F = 0.64. A table of half cycles gave 5.6 % less."""
     result = loop_of(Bilinear(), 0.006, [100.0, 1.0])
     assert abs(result.starts[0, 2] - 0.64 / 1.2) < 1e-9
-    assert abs(result.coefficients[0, 0] / 0.006 - (93.271 + 12.182j)) < 1e-3
+    assert abs(result.harmonics[0, 0] / 0.006 - (93.271 + 12.182j)) < 1e-3
     for A in (0.002, 0.006, 0.03, 3.0):
         result = loop_of(Bilinear(), A, [100.0, 1.0], harmonics=HARMONICS)
         hand = PiecewiseByHand(1.0, [0.5, 1.0], [100.0, 20.0, 0.0])
         c = by_oracle(hand, A, result, True, 1.0)
-        for found in (result.coefficients[0], harmonics_of(Bilinear(100.0, 1.0), A)):
+        for found in (result.harmonics[0], harmonics_of(Bilinear(100.0, 1.0), A)):
             assert np.max(np.abs(found - c)) < 1e-8 * np.max(np.abs(c))
 
 
@@ -254,7 +254,7 @@ def test_pinched_slopes(law):
         result = loop_of(law(), A, [100.0, 1.0], harmonics=HARMONICS)
         hand = PiecewiseByHand(1.0, [0.2975, 0.3025, 1.0], [100.0, 10.0, 100.0, 0.0])
         c = by_oracle(hand, A, result, True, 1.0)
-        for found in (result.coefficients[0], harmonics_of(law(100.0, 1.0), A)):
+        for found in (result.harmonics[0], harmonics_of(law(100.0, 1.0), A)):
             assert np.max(np.abs(found - c)) < 1e-8 * np.max(np.abs(c))
 
 
@@ -269,7 +269,7 @@ def test_even_harmonics_of_a_rate_dependent_law():
     result = loop_of(Drifting(), 2.0, [3.0, 1.0, 0.4], harmonics=HARMONICS)
     c = by_oracle(ByHand(1.0, 3.0, asymmetry=0.4), 2.0, result, False, 1.0)
     assert abs(c[2]) > 1e-2
-    for found in (result.coefficients[0], harmonics_of(Drifting(3.0, 1.0, 0.4), 2.0)):
+    for found in (result.harmonics[0], harmonics_of(Drifting(3.0, 1.0, 0.4), 2.0)):
         assert np.max(np.abs(found - c)) < 1e-9 * np.max(np.abs(c))
 
 
@@ -283,7 +283,7 @@ def test_even_harmonics_where_directions_differ_at_large_forces_alone():
     result = loop_of(law, amplitude, [1e4, 30.0], harmonics=HARMONICS)
     c = by_oracle(ByHand(30.0, 1e4), amplitude, result, False, 30.0)
     assert abs(c[2]) > 1.0
-    for found in (result.coefficients[0], harmonics_of(law, amplitude)):
+    for found in (result.harmonics[0], harmonics_of(law, amplitude)):
         assert np.max(np.abs(found - c)) < 1e-9 * np.max(np.abs(c))
 
 
@@ -309,7 +309,7 @@ def test_even_harmonics_of_a_comparison_of_the_force():
     assert top > 10.0 > bottom
     expected = loop_oracles.harmonics_of([way(top, -1.0), way(bottom, 1.0)], A, HARMONICS)
     assert abs(expected[2]) > 0.1
-    found = (loop_of(Stepped(), A, [k, f], harmonics=HARMONICS).coefficients[0],
+    found = (loop_of(Stepped(), A, [k, f], harmonics=HARMONICS).harmonics[0],
              harmonics_of(Stepped(k, f), A))  # fmt: skip
     for c in found:
         assert np.max(np.abs(c - expected)) < 1e-9 * np.max(np.abs(expected))
@@ -341,7 +341,7 @@ def test_derivatives_of_loops_with_a_kink_at_a_speed(law):
     size = np.max(np.abs(expected(values, A)))
     for kernel in (loops, settled):
         result = kernel(*arguments, chosen=range(3), harmonics=orders)
-        assert np.max(np.abs(result.coefficients[0] - expected(values, A))) < 1e-9 * size
+        assert np.max(np.abs(result.harmonics[0] - expected(values, A))) < 1e-9 * size
         for i in range(3):
             step = np.zeros(3)
             step[i] = 1e-5 * values[i]
@@ -390,7 +390,7 @@ def test_derivatives_of_settled_motions_are_differences_of_oracles():
                        np.array([1e-2, 0.4, 1.0, 1e-2]))  # fmt: skip
         return fixed_point(plant, result.starts[0], result.maps[0], omega, True, harmonics)[1]
 
-    size = np.max(np.abs(result.coefficients[0]))
+    size = np.max(np.abs(result.harmonics[0]))
     for i in (0, 1, 3, 4, 5, 6):
         step = np.zeros(values.size)
         step[i] = 1e-4 * values[i]
@@ -456,7 +456,7 @@ def test_derivatives_of_harmonics_that_parameters_change_at_once():
     first = 2.0 / np.sqrt(np.pi) * gamma(0.5 * p + 1.0) / gamma(0.5 * p + 1.5)
     c_1 = 1j * c * first * (A * omega / v_0) ** p
     by_p = np.log(A * omega / v_0) + 0.5 * (digamma(0.5 * p + 1.0) - digamma(0.5 * p + 1.5))
-    assert abs(result.coefficients[0, 0] - c_1) < 1e-7 * abs(c_1)
+    assert abs(result.harmonics[0, 0] - c_1) < 1e-7 * abs(c_1)
     assert abs(result.by_amplitude[0, 0] - p * c_1 / A) < 1e-6 * abs(c_1 / A)
     expected = c_1 * np.array([1.0 / c, by_p, -p / v_0])
     assert np.max(np.abs(result.by_parameter[0, 0] - expected) * values) < 1e-6 * abs(c_1)
@@ -550,14 +550,14 @@ def test_plants_near_stick_and_in_resonance(share):
         result = settled(system, np.array([U]), np.array([omega]), values[None],
                          harmonics=HARMONICS)  # fmt: skip
         assert result.found[0]
-        size = float(np.max(np.abs(result.coefficients[0])))
+        size = float(np.max(np.abs(result.harmonics[0])))
         plant = Oracle(
             [DahlByHand(0.1, 30.0)],
             lambda t, U=U, w=omega: (U * np.cos(w * t), 0.0),  # type: ignore[misc]
             False, 0.3, 0.24, 0.3, np.array([size, size * omega, min(0.1, 30.0 * size)]),
         )  # fmt: skip
         _, c, _ = fixed_point(plant, result.starts[0], result.maps[0], omega, True)
-        assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * size
+        assert np.max(np.abs(result.harmonics[0] - c)) < 1e-8 * size
 
 
 @pytest.mark.parametrize("odd", [True, False])
@@ -571,7 +571,7 @@ def test_derivatives_of_a_plant_that_sticks_are_those_of_springs(odd):
     R = 1.0 / (90.0 - 0.5 * omega**2 + 0.8j * omega)
     assert U * abs(R) < 0.02
     expected = -U * R**2 * np.array([1.0, 1.0, 0.0, 0.0, -(omega**2), 1j * omega, 1.0])
-    assert np.max(np.abs(result.coefficients[0] - [0.0, U * R])) < 1e-9 * abs(U * R)
+    assert np.max(np.abs(result.harmonics[0] - [0.0, U * R])) < 1e-9 * abs(U * R)
     assert np.max(np.abs(result.by_amplitude[0] - [0.0, R])) < 1e-8 * abs(R)
     error = (result.by_parameter[0] - [np.zeros(7), expected]) * values
     assert np.max(np.abs(error)) < 1e-8 * abs(U * R)
@@ -583,8 +583,8 @@ def test_where_no_motion_settles_none_is_found():
     result = settled(system, np.ones(2), np.array([10.0, 10.0]),
                      np.array([[1.0, 0.0, 100.0], [1.0, 1e-3, 100.0]]))  # fmt: skip
     assert result.found.tolist() == [False, True]
-    assert np.isnan(result.coefficients[0]).all()
-    assert abs(result.coefficients[1, 0] - 1.0 / (1j * 10.0 * 1e-3)) < 1e-6 * 100.0
+    assert np.isnan(result.harmonics[0]).all()
+    assert abs(result.harmonics[1, 0] - 1.0 / (1j * 10.0 * 1e-3)) < 1e-6 * 100.0
     knots = np.linspace(0.0, 100.0, 11)
     with pytest.raises(FitError, match="beyond all bounds"):
         march(system, knots, np.ones((1, 10)), knots, np.zeros(2), np.array([1.0, -200.0, 1.0]))

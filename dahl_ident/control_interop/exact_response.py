@@ -15,7 +15,7 @@ from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
 from dahl_ident.elements.element import Model
 
 if TYPE_CHECKING:
-    from dahl_ident.engine import SteadyMotion
+    from dahl_ident.engine import Settled
 
 HARMONICS = tuple(range(10))
 """The harmonics of a motion that are returned."""
@@ -74,7 +74,7 @@ def exact_motions(
     values = np.array([float(v) for v in model.known_values()])
     motions: list[list[_Orbit]] = [[] for _ in omega]
 
-    def solve(rows: IntArray, starts: FloatArray | None, **options: Any) -> SteadyMotion:
+    def solve(rows: IntArray, starts: FloatArray | None, **options: Any) -> Settled:
         return shooting(
             np.tile(values, (rows.size, 1)),
             omega[rows],
@@ -84,7 +84,7 @@ def exact_motions(
             **({"stable": False} | options),
         )
 
-    def add_new(rows: IntArray, solution: SteadyMotion) -> IntArray:
+    def add_new(rows: IntArray, solution: Settled) -> IntArray:
         """Add the motions that are new; return their indices."""
         new = []
         for i in np.flatnonzero(solution.found & np.isfinite(solution.multiplier)).tolist():

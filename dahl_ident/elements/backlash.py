@@ -30,7 +30,7 @@ from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
-    from dahl_ident.engine import Loops
+    from dahl_ident.engine import Settled
 
 _CLOSED_GAP = 1e-9  # gap over the smallest amplitude, in the limit of no gap
 _NARROWEST = 1e-9  # gap over the path: the crossing of a narrower gap is not resolved
@@ -140,7 +140,7 @@ class Backlash(Friction):
 
     def _loops(
         self, table: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
-    ) -> Loops:
+    ) -> Settled:
         """Return the settled loops at rows of amplitude, frequency and values."""
         return loops_of(self._element, table, orders, chosen, gap=True)
 

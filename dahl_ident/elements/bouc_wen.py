@@ -13,7 +13,7 @@ from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 
 if TYPE_CHECKING:
-    from dahl_ident.engine import Loops
+    from dahl_ident.engine import Settled
 
 _P = 4  # column of p in rows of amplitude, frequency and values
 _AT_ONCE = 1e4, 1e8  # p times amplitude above which N changes by less than 2e-4
@@ -143,7 +143,7 @@ class BoucWen(Friction):
 
     def _loops(
         self, table: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
-    ) -> Loops:
+    ) -> Settled:
         """Return settled loops, with p limited to that of instant unloading.
 
         Data in gross slip do not bound p, so searches may let it grow without end.

@@ -20,7 +20,7 @@ from dahl_ident.elements.friction import Friction
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
-    from dahl_ident.engine import SteadyMotion, System
+    from dahl_ident.engine import Settled, System
 
 Steady = Literal["exact", "describing function"]
 STEADY: tuple[Steady, ...] = ("exact", "describing function")
@@ -124,7 +124,7 @@ class Shooting:
         chosen: Sequence[int] = (),
         stable: bool = True,
         **options: Any,
-    ) -> SteadyMotion:
+    ) -> Settled:
         """Return the steady motions of many rows, with values that the engine can resolve.
 
         If `stable`, a motion that is not stable counts as none. Options and result are those of
@@ -164,7 +164,7 @@ class Shooting:
         drive: FloatArray,
         chosen: Sequence[int],
         **options: Any,
-    ) -> SteadyMotion:
+    ) -> Settled:
         """Return the steady motions of many rows, at values that the engine resolves."""
         from dahl_ident.engine import steady_motions
 

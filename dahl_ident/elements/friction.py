@@ -42,7 +42,7 @@ from dahl_ident.elements.law_checks import check_declarations, check_slope, scal
 from dahl_ident.errors import ModelError, ValidationError
 
 if TYPE_CHECKING:
-    from dahl_ident.engine import Loops
+    from dahl_ident.engine import Settled
 
 _SMALLEST = 1e-100  # m; smaller amplitudes count as rest
 _FARTHEST_SLIP = 1e9  # m; a law that has not slipped fully there never does
@@ -162,7 +162,7 @@ class Friction(Element):
         columns = columns.reshape(np.shape(sine.harmonic))
         loops = self._loops(table, orders.tolist(), chosen)
         A = table[:, :1]
-        value = loops.coefficients / A
+        value = loops.harmonics / A
         at_rest = A[:, 0] <= _SMALLEST
         if self.rate_independent and at_rest.any():
             stiffness = self.rest_stiffness(list(table[at_rest, 2:].T))
@@ -177,7 +177,7 @@ class Friction(Element):
 
     def _loops(
         self, table: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
-    ) -> Loops:
+    ) -> Settled:
         """Return the settled loops at rows of amplitude, frequency and values."""
         return loops_of(self, table, orders, chosen)
 
@@ -278,7 +278,7 @@ class Friction(Element):
     ) -> FloatArray:
         """Return the factor by which a deviation from the settled loop shrinks in one cycle."""
         table, rows = self._table(values, amplitude, omega)
-        return np.asarray(np.abs(self._loops(table).decays)[rows])
+        return np.asarray(np.abs(self._loops(table).multiplier)[rows])
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
         up, down = (float(v) for v in self.force_limits([np.asarray(v) for v in values]))
@@ -290,7 +290,7 @@ class Friction(Element):
 
     def _top(self, values: Sequence[float], amplitude: float) -> float:
         """Return the force of the settled loop at the largest displacement."""
-        return float(self._loops(np.array([[amplitude, 1.0, *values]])).tops[0])
+        return float(self._loops(np.array([[amplitude, 1.0, *values]])).starts[0, 0])
 
     def _coefficients(self, amplitude: FloatArray, harmonic: int) -> ComplexArray:
         """Return F_k/X_1; refuse amplitudes at which no loop settles."""

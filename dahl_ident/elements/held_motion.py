@@ -18,7 +18,7 @@ from dahl_ident.elements.equations import FirstState, law_equations
 from dahl_ident.elements.facts import HistoryGradient, Path
 
 if TYPE_CHECKING:
-    from dahl_ident.engine import Loops, System
+    from dahl_ident.engine import Settled, System
 
 _SYSTEMS: dict[Hashable, System] = {}
 """Compiled equations by law; not attributes of the laws, which are sent to other processes."""
@@ -81,7 +81,7 @@ def loops_of(
     chosen: Sequence[int],
     *,
     gap: bool = False,
-) -> Loops:
+) -> Settled:
     """Return the settled loops of a law at rows of amplitude, frequency and values.
 
     With `gap`, the width of a gap in series follows the law's values.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dahl_ident.engine.motion import Loops, Marched, Settled, loops, march, settled
-from dahl_ident.engine.periodic import SteadyMotion, steady_motions
+from dahl_ident.engine.motion import Marched, Settled, loops, march, settled
+from dahl_ident.engine.periodic import steady_motions
 from dahl_ident.engine.sampled import (
     band_limited,
     differentiated,
@@ -15,10 +15,8 @@ from dahl_ident.engine.translate import Equations, System, translate
 
 __all__ = [
     "Equations",
-    "Loops",
     "Marched",
     "Settled",
-    "SteadyMotion",
     "System",
     "band_limited",
     "differentiated",

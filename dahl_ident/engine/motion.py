@@ -35,43 +35,32 @@ _KERNELS = (
 
 
 class Settled(NamedTuple):
-    """Settled motions under ``amplitude cos(omega t)``; one row each.
+    """Settled motions, or loops of laws, under ``amplitude cos(omega t)``; one row each.
 
     Attributes
     ----------
     found : ndarray of bool, shape (rows,)
-    coefficients : ndarray of complex, shape (rows, harmonics)
+    harmonics : ndarray of complex, shape (rows, K)
         c_k of the output, sum of Re c_k exp(j k omega t); c_0 is its mean. NaN where not found.
-    by_amplitude : ndarray of complex, shape (rows, harmonics)
-    by_parameter : ndarray of complex, shape (rows, harmonics, chosen)
+    by_amplitude : ndarray of complex, shape (rows, K)
+    by_parameter : ndarray of complex, shape (rows, K, chosen)
     starts : ndarray, shape (rows, order)
-        States at t = 0.
+        States at t = 0; of a loop the force alone.
+    multiplier : ndarray, shape (rows,)
+        Largest factor by which a small deviation grows in a cycle: the largest modulus of Floquet's
+        multipliers. Above 1 a motion is unstable.
     maps : ndarray, shape (rows, order, order)
         Derivatives of the states after a cycle, or after half a cycle with the sign of an odd
-        system, with respect to those at its beginning.
+        system, with respect to those at its beginning; empty for loops.
     """
 
     found: BoolArray
-    coefficients: ComplexArray
+    harmonics: ComplexArray
     by_amplitude: ComplexArray
     by_parameter: ComplexArray
     starts: FloatArray
-    maps: FloatArray
-
-
-class Loops(NamedTuple):
-    """Settled loops of a law, as :class:`Settled`; one row each.
-
-    `tops` are the forces at the largest displacement, `decays` the factors by which a deviation
-    shrinks in a cycle, (rows,).
-    """
-
-    found: BoolArray
-    coefficients: ComplexArray
-    by_amplitude: ComplexArray
-    by_parameter: ComplexArray
-    tops: FloatArray
-    decays: FloatArray
+    multiplier: FloatArray
+    maps: FloatArray = np.empty(0)
 
 
 class Marched(NamedTuple):
@@ -138,9 +127,12 @@ def settled(
         cycles,
         _SETTLED / finer,
     )
-    found = found.astype(bool)
-    result[~found] = np.nan
-    return Settled(found, result[..., 0], result[..., 1], result[..., 2:], first, maps)
+    with np.errstate(invalid="ignore"):
+        finite = found.astype(bool) & np.isfinite(maps).all(axis=(1, 2))
+    moduli = np.abs(np.linalg.eigvals(maps[finite])).max(axis=1, initial=0.0)
+    multiplier = np.full(found.size, np.nan)
+    multiplier[finite] = moduli**2 if system.odd else moduli  # the map of half a cycle
+    return _settled(found, result, first, multiplier, maps)
 
 
 def loops(
@@ -153,7 +145,7 @@ def loops(
     harmonics: Sequence[int] = (1,),
     gap: bool = False,
     finer: float = 1.0,
-) -> Loops:
+) -> Settled:
     """Return the settled loops of a law with one state under sines of displacement.
 
     Arguments are those of :func:`settled`; harmonics must rise. If the link to the law has a `gap`,
@@ -171,9 +163,13 @@ def loops(
         np.asarray(harmonics, dtype=np.int64),
         _LOOP / finer / (_RATED if system.sizes[4] else 1.0),
     )
-    found = found.astype(bool)
-    result[~found] = np.nan
-    return Loops(found, result[..., 0], result[..., 1], result[..., 2:], tops, decays)
+    return _settled(found, result, tops[:, None], decays)
+
+
+def _settled(found: FloatArray, result: ComplexArray, *others: FloatArray) -> Settled:
+    """Return what a kernel has found; NaN where nothing settles."""
+    result[found == 0] = np.nan
+    return Settled(found.astype(bool), result[..., 0], result[..., 1], result[..., 2:], *others)
 
 
 def march(

@@ -8,43 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
-from dahl_ident.engine.motion import settled
+from dahl_ident.arrays import BoolArray, FloatArray
+from dahl_ident.engine.motion import Settled, settled
 from dahl_ident.engine.translate import System
 
 _FINER_STEPS = 10.0  # factor: coarse steps may pass over two turning points that are close together
 _LONG = 30  # cycles in which a motion leaves an unstable branch for a stable one
 # runs of cycles without Newton's method, and cycles of each, more than the kernel computes
 _LONG_RUNS, _ALL_CYCLES = 3, 1000
-
-
-class SteadyMotion(NamedTuple):
-    """Steady motions under forces ``u_0 cos(omega t)``, one row each.
-
-    Attributes
-    ----------
-    found : ndarray of bool, shape (rows,)
-        Whether there is one.
-    harmonics : ndarray of complex, shape (rows, K)
-        X_k, x(t) = sum of Re X_k exp(j k omega t). NaN where not found.
-    by_drive : ndarray of complex, shape (rows, K)
-    by_parameter : ndarray of complex, shape (rows, K, chosen)
-    starts : ndarray, shape (rows, order)
-        States at t = 0.
-    multiplier : ndarray, shape (rows,)
-        Largest modulus of the multipliers of a whole cycle; above 1 a motion is unstable.
-    """
-
-    found: BoolArray
-    harmonics: ComplexArray
-    by_drive: ComplexArray
-    by_parameter: ComplexArray
-    starts: FloatArray
-    multiplier: FloatArray
 
 
 def steady_motions(
@@ -60,7 +34,7 @@ def steady_motions(
     again: bool = True,
     largest: float = np.inf,
     one_sided: bool = False,
-) -> SteadyMotion:
+) -> Settled:
     """Return the steady motions of a system at rows of parameters, frequency and drive.
 
     Each row begins from its states `starts` at t = 0, NaN for rest, and runs through some `cycles`
@@ -70,7 +44,7 @@ def steady_motions(
     motion is unstable.
     """
     rows, K = omega.size, len(harmonics)
-    result = SteadyMotion(
+    result = Settled(
         np.zeros(rows, dtype=np.bool_),
         np.full((rows, K), np.nan + 0j),
         np.full((rows, K), np.nan + 0j),
@@ -109,13 +83,9 @@ def steady_motions(
                     finer=finer,
                 )
             states = motions.starts
-        multiplier = np.full(solved.size, np.nan)
-        ok = motions.found & np.isfinite(motions.maps).all(axis=(1, 2))
-        moduli = np.abs(np.linalg.eigvals(motions.maps[ok])).max(axis=1, initial=0.0)
-        multiplier[ok] = moduli**2 if symmetric.odd else moduli  # the map of half a cycle
-        result.multiplier[solved] = multiplier
+        multiplier = result.multiplier[solved] = motions.multiplier
         with np.errstate(invalid="ignore"):
-            good = ok & (multiplier <= largest)
+            good = multiplier <= largest
         # the first five fields of both tuples correspond
         for array, part in zip(result[:5], (good, *motions[1:5]), strict=True):
             array[solved[good]] = part[good]

@@ -180,7 +180,7 @@ class SteadyRows:
             again=again,
             stable=stable,
         )
-        X = [motions.harmonics[..., None], motions.by_drive[..., None], motions.by_parameter]
+        X = [motions.harmonics[..., None], motions.by_amplitude[..., None], motions.by_parameter]
         return _SteadyMotions(
             np.concatenate(X, axis=-1), motions.starts, motions.harmonics[:, 0], motions.multiplier
         )
