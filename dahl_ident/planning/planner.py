@@ -228,18 +228,13 @@ def plan(
 
 
 def _of_motions(question: PlanRequest) -> Plan:
-    """Return the better of two plans of motions.
+    """Return the plan with the information of a repeat in records that last as long as the plan.
 
-    Both need the information of a repeat, which depends on their number, because a record's
-    unknowns take about one repeat. The first plan assumes the same number for all motions; the
-    second the number that fits into the time of the first plan.
+    This information depends on the number of repeats, because a record's unknowns take about one.
     """
-    first = Search(question, options_of(question, question.limits))
-    first_best = first.best()
-    second = Search(question, options_of(question, question.limits, lasting=first_best.seconds))
-    second_best = second.best()
-    better = second.score(second_best) > first.score(first_best)
-    return _plan(second, second_best) if better else _plan(first, first_best)
+    lasting = Search(question, options_of(question, question.limits)).best().seconds
+    search = Search(question, options_of(question, question.limits, lasting=lasting))
+    return _plan(search, search.best())
 
 
 def _plan(search: Search, design: Design) -> Plan:

@@ -22,11 +22,9 @@ _POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # to average scatter between runs: a ninth run would gain 6 %
 _WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of suspected parameters; the least that suffices
 LONGEST = 30.0 * 86400.0  # s: a month, the longest plan if no time is given
-_TIMES = 20  # corrections at most of the time that reaches a target
+_LONGER = 4.0  # factor from one time to the next until a target is reached
 _HELPS = 0.1  # more time is useless below this fraction of the gain by the square root of time
-_TARGET_MET = 0.985  # fraction of the target at which the search stops
-_AIMED = 0.995  # fraction of the target that a corrected time aims at
-_NARROWS = 0.6  # a correction that leaves more than this of the log interval is replaced by halving
+_CLOSE = 0.985  # fraction of the plan's time in which the target is not reached any more
 _APART = 2.0  # span of levels, in ranges that a fit takes as one amplitude: these are not exact
 _GRID_LEVELS = 10  # levels of the usual logarithmic plan with which the best one is compared
 _CORRECTIONS = 6  # of the repeats of motions, each with the whole information
@@ -67,15 +65,6 @@ class Search:
                 "s to change over, settle and measure; give more time"
             )
         return design if q.recorded is None else self._exactly(design)
-
-    def score(self, design: Design) -> tuple[bool, float]:
-        """Return the score of a design, larger for the better of two for the same question."""
-        if self.question.has_numbers:
-            reached = self.reached(design)
-            return reached, -design.seconds if reached else -design.ratio
-        term = self.forecast.thinned().term(self.question.target)
-        value, _ = Objective((term,)).only(design.levels).at(design.cycles)
-        return True, float(value)
 
     def solve(self, time: float, start: Sequence[int] = ()) -> Design | None:
         """Return the best levels and runs for a time; None where it is too short."""
@@ -165,40 +154,24 @@ class Search:
         """
         most = min(self.question.limits.time, LONGEST)
         time = min(most, 30.0 * float(np.median(self.bench.alone)) + 1.0)
-        best: Design | None = None
-        last: Design | None = None
-        start: list[int] = []
-        short, wide = 0.0, np.inf
-        for _ in range(_TIMES):
-            latest = self.solve(time, start)
-            if latest is not None:
-                start = latest.levels.tolist()
-            if latest is not None and self.reached(latest):
-                best = latest if best is None or latest.seconds < best.seconds else best
-                if latest.ratio >= _TARGET_MET:
-                    break
+        short, design = 0.0, self.solve(time)
+        while design is None or not self.reached(design):
+            if time >= most:
+                return design
+            short, time, before = time, min(_LONGER * time, most), design
+            design = self.solve(time, () if before is None else before.levels.tolist())
+            if before is not None and design is not None and design.ratio > 1.0:
+                by_time = 0.5 * np.log(design.seconds / before.seconds)
+                if np.log(before.ratio / design.ratio) < _HELPS * by_time:
+                    return before
+        while short < _CLOSE * design.seconds:
+            time = float(np.sqrt(design.seconds * max(short, design.seconds / _LONGER)))
+            shorter = self.solve(time, design.levels.tolist())
+            if shorter is not None and self.reached(shorter):
+                design = shorter
             else:
-                short = max(short, time)
-            if best is None:
-                if time >= most:
-                    return latest or last
-                if latest is not None and latest.ratio > 1.0 and last is not None:
-                    by_time = 0.5 * np.log(latest.seconds / last.seconds)
-                    if np.log(last.ratio / latest.ratio) < _HELPS * by_time:
-                        return last
-                last = latest or last
-                factor = 4.0 if last is None else float(np.clip(last.ratio**2, 1.3, 1e3))
-                time = min(factor * time, most)
-                continue
-            if short >= _TARGET_MET * best.seconds:
-                break
-            fixed = best.runs * float(self.bench.fixed(best.levels))
-            time = fixed + (best.seconds - fixed) * (best.ratio / _AIMED) ** 2
-            narrow = np.log(best.seconds / max(short, 1e-3 * best.seconds))
-            if not short < time < 0.99 * best.seconds or narrow > _NARROWS * wide:
-                time = float(np.sqrt(best.seconds * max(short, 0.25 * best.seconds)))
-            wide = narrow
-        return best or last
+                short = time
+        return design
 
     def _exactly(self, design: Design) -> Design:
         """Return the repeats that reach the targets by the information of the whole records.
