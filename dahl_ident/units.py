@@ -183,11 +183,15 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
     for candidate in _meanings(unit):
         for kind in kinds:
             for motion, si in zip(MOTIONS, SI_UNITS[kind], strict=True):
-                if _same(candidate.dimension, parse_unit(si).dimension, kind):
+                dimension, expected = candidate.dimension, parse_unit(si).dimension
+                if kind in MECHANICAL_KINDS and kind not in MOTION_KINDS:
+                    # a rotary stiffness may be in N m or N m/rad
+                    dimension, expected = map(_without_angle, (dimension, expected))
+                if dimension == expected:
                     return kind, motion, candidate.factor
-    expected = " or ".join(dict.fromkeys(u for kind in kinds for u in SI_UNITS[kind]))
+    units = " or ".join(dict.fromkeys(u for kind in kinds for u in SI_UNITS[kind]))
     raise UnitError(
-        f"{what} has the unit [{unit.text}]; expected a unit of the dimension of {expected}"
+        f"{what} has the unit [{unit.text}]; expected a unit of the dimension of {units}"
         + (" (pound-force is lbf, kilogram-force kgf)" if "force" in kinds else "")
     )
 
@@ -334,13 +338,6 @@ def _meanings(unit: Unit) -> list[Unit]:
 
 def _without_angle(dimension: Dimension) -> Dimension:
     return tuple(part for part in dimension if part[0] != "radian")
-
-
-def _same(first: Dimension, second: Dimension, kind: str) -> bool:
-    if kind in MECHANICAL_KINDS and kind not in MOTION_KINDS:
-        # a rotary stiffness may be in N m or N m/rad
-        return _without_angle(first) == _without_angle(second)
-    return first == second
 
 
 class QuantityForm(NamedTuple):

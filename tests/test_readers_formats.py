@@ -87,6 +87,15 @@ class TestExcel:
         with pytest.raises(DataError, match="row 5, column 'x': the cell is empty or NaN"):
             read_record(path)
 
+    def test_a_sheet_with_a_chart_alone(self, tmp_path):
+        path = self.book(tmp_path / "run.xlsx")
+        book = openpyxl.load_workbook(path)
+        book.create_chartsheet("picture", 0)
+        book.save(path)
+        assert_the_run(read_record(path))
+        with pytest.raises(DataError, match="no sheet 'picture'; there are run"):
+            read_record(path, sheet="picture")
+
     def test_a_changed_digit(self, tmp_path):
         path, plain = self.book(tmp_path / "run.xlsx"), tmp_path / "plain.xlsx"
         with zipfile.ZipFile(path) as packed, zipfile.ZipFile(plain, "w") as stored:

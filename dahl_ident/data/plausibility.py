@@ -93,18 +93,12 @@ def check_energy(file: str, data: FrequencyResponse, warn: Warn) -> None:
         )
     creating = np.zeros(data.n, dtype=bool)
     creating[fundamental] = creates_energy(loss, std, dof)
-    if part.covariance is None:
-        creating[fundamental] |= _opposite_phase(part)
-    warn(creating, "the phase's sign creates energy")
-
-
-def _opposite_phase(part: FrequencyResponse) -> BoolArray:
-    """Return the few rows whose phase is about as large as that of the others but negative."""
     sine = part.response.imag / part.gain
     negative = sine < 0.0
-    if part.n < _FEWEST_ROWS or negative.sum() > max(1.0, _FEW_ROWS * part.n):
-        return np.zeros(part.n, dtype=bool)
-    return np.asarray(sine < -0.5 * np.median(sine[~negative]))
+    few = part.n >= _FEWEST_ROWS and negative.sum() <= max(1.0, _FEW_ROWS * part.n)
+    if part.covariance is None and few:  # phases as large as those of the others, but negative
+        creating[fundamental] |= sine < -0.5 * np.median(sine[~negative])
+    warn(creating, "the phase's sign creates energy")
 
 
 def check_phase_size(data: FrequencyResponse, warn: Warn) -> None:

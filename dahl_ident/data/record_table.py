@@ -39,7 +39,10 @@ def record_from(
     if missing == "drop":
         complete = np.ones(size, dtype=bool)
         for channel in channels.values():
-            numbers = _numeric(channel)
+            numbers = channel.values
+            if numbers.dtype.kind not in "fiu":  # text counts as present
+                numbers = np.where(np.char.strip(numbers.astype(str)) == "", np.nan, 0.0)
+            numbers = numbers.astype(np.float64)
             complete &= np.isfinite(numbers)
             for mark in missing_marks(numbers[np.isfinite(numbers)]):
                 bound.warn(
@@ -114,13 +117,6 @@ def _channels(bound: Binding) -> dict[str, RawChannel]:
             )
         bound.required("force")
     return channels
-
-
-def _numeric(channel: RawChannel) -> FloatArray:
-    """Return the numbers of a channel, with NaN for missing ones; text counts as present."""
-    if channel.values.dtype.kind in "fiu":
-        return channel.values.astype(np.float64)
-    return np.array([np.nan if not str(v).strip() else 0.0 for v in channel.values])
 
 
 def _samples(bound: Binding, role: str, channel: RawChannel) -> FloatArray:

@@ -472,7 +472,10 @@ def _combined(a: Point, b: Point) -> Point:
     # degrees of freedom by the Welch-Satterthwaite formula
     traces = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in separate]
     inverse_dof = sum((t / sum(traces)) ** 2 / p.dof for t, p in zip(traces, (a, b), strict=True))
-    verdicts = zip(a.quality["verdict"], b.quality["verdict"], strict=True)
+    verdicts = []
+    for both in zip(a.quality["verdict"], b.quality["verdict"], strict=True):
+        objections = dict.fromkeys(part for text in both for part in text.split("; "))
+        verdicts.append("; ".join(part for part in objections if part != "good") or "good")
     quality = {
         **a.quality,
         **{name: mean(a.quality[name], b.quality[name]) for name in _MEANS},
@@ -481,7 +484,7 @@ def _combined(a: Point, b: Point) -> Point:
         "num_periods": periods,
         "settling_periods": settling,
         "end_time": b.quality["end_time"],
-        "verdict": [_merged_verdict(*both) for both in verdicts],
+        "verdict": verdicts,
     }
     means = ("frequency_hz", "amplitude", "drive", "response")
     return replace(
@@ -492,8 +495,3 @@ def _combined(a: Point, b: Point) -> Point:
         dof=np.asarray(1.0 / inverse_dof),
         quality=quality,
     )
-
-
-def _merged_verdict(first: str, second: str) -> str:
-    parts = [part for text in (first, second) for part in text.split("; ") if part != "good"]
-    return "; ".join(dict.fromkeys(parts)) or "good"

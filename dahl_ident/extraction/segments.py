@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray, IntArray
+from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ExtractionError, Placeholder, argument
 from dahl_ident.extraction.cycles import (
     Cycles,
@@ -264,18 +264,6 @@ def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
         return None
     inverse = np.asarray(np.linalg.inv(normal), np.float64)
     coefficients = inverse @ right[:, 0]
-    cc, ss, cs, c, s = _cycle_sums(segment, cuts, coefficients)
-    determinant = cc * ss - cs**2
-    full = determinant > 0.1 * cc * ss  # a cycle without samples carries no information
-    dof = 2 * int(full.sum()) - 4
-    if dof < 2:
-        return None
-    explained = (ss * c**2 + cc * s**2 - 2.0 * cs * c * s)[full] / determinant[full]
-    return _Inside(segment, coefficients, inverse, float(explained.sum()) / dof, dof)
-
-
-def _cycle_sums(segment: Segment, cuts: IntArray, coefficients: FloatArray) -> FloatArray:
-    """Return sums over each cycle of cos^2, sin^2, cos sin, and of both times the residual."""
     sums = np.zeros((5, cuts.size - 1))
     for first, last in groups_of_cycles(cuts):
         part = slice(int(cuts[first]), int(cuts[last]))
@@ -285,7 +273,14 @@ def _cycle_sums(segment: Segment, cuts: IntArray, coefficients: FloatArray) -> F
         products = np.stack([cos * cos, sin * sin, cos * sin, cos * residual, sin * residual])
         running = np.cumsum(np.pad(products, ((0, 0), (1, 0))), axis=1)
         sums[:, first:last] = np.diff(running[:, cuts[first : last + 1] - cuts[first]], axis=1)
-    return sums
+    cc, ss, cs, c, s = sums
+    determinant = cc * ss - cs**2
+    full = determinant > 0.1 * cc * ss  # a cycle without samples carries no information
+    dof = 2 * int(full.sum()) - 4
+    if dof < 2:
+        return None
+    explained = (ss * c**2 + cc * s**2 - 2.0 * cs * c * s)[full] / determinant[full]
+    return _Inside(segment, coefficients, inverse, float(explained.sum()) / dof, dof)
 
 
 def _extended(

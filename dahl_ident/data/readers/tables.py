@@ -85,25 +85,20 @@ def _cells(file: File) -> dict[str, list[list[Any]]]:
     def read() -> dict[str, list[list[Any]]]:  # pragma: no cover
         with file.opened() as content:
             book = calamine.CalamineWorkbook.from_filelike(content)
-            return {name: _rows(book, name) for name in book.sheet_names}
+            return {
+                sheet.name: [
+                    [c if isinstance(c, (float, int, str, bool)) else str(c) for c in row]  # dates
+                    for row in book.get_sheet_by_name(sheet.name).to_python(skip_empty_area=False)
+                ]
+                for sheet in book.sheets_metadata
+                if sheet.typ == calamine.SheetTypeEnum.WorkSheet
+            }
 
     cells, error = in_child_process(read, seconds=_SECONDS, bytes_at_most=_BYTES)
     if error:
         raise DataError(f"{file.name}: the workbook is damaged, or too large: {error[:200]}")
     sheets: dict[str, list[list[Any]]] = cells
     return sheets
-
-
-def _rows(book: Any, name: str) -> list[list[Any]]:  # pragma: no cover
-    """Return the cells of a sheet; numbers, text and truth values unchanged, dates as text."""
-    try:
-        rows = book.get_sheet_by_name(name).to_python(skip_empty_area=False)
-    except Exception as exc:
-        if "worksheet" in type(exc).__name__.lower() or "chart" in str(exc).lower():
-            return []  # a sheet with a chart
-        raise
-    plain = (float, int, str, bool)
-    return [[cell if isinstance(cell, plain) else str(cell) for cell in row] for row in rows]
 
 
 def _table(file: File, sheet: str, cells: list[list[Any]]) -> RawFile | None:
