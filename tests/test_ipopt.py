@@ -384,7 +384,7 @@ def test_misplaced_errors_of_the_drive():
         driven.frequency_hz, driven.response, drive=driven.drive, controlled="force",
         quantity="receptance", covariance=covariance,
     )  # fmt: skip
-    with pytest.raises(ValidationError, match=r"drive_std has shape \(3,\); expected .* \(12,\)"):
+    with pytest.raises(ValidationError, match=r"drive_std: expected shape \(12,\), .*got \(3,\)"):
         solve_ipopt(TableProblem(known, UNKNOWN_PLANT), drive_std=[0.1, 0.2, 0.3])
     with pytest.raises(ValidationError, match="without drive_std"):
         solve_ipopt(

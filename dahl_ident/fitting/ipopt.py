@@ -1,9 +1,8 @@
 r"""Least squares by IPOPT: constraints between parameters, and noise in the drive as well.
 
-The problem is that of :mod:`dahl_ident.fitting.search`, for any law and for exact steady motions:
-the cost and its exact gradient J' r are those of the problem's residuals. The Hessian is computed
-from differences of gradients, because far from the optimum the Gauss-Newton Hessian misleads IPOPT.
-From the least-squares optimum IPOPT takes a few steps.
+The problem is that of :mod:`dahl_ident.fitting.search`, for any law and for exact steady motions.
+Each step minimises the cost of linearised residuals, damped as by Levenberg and Marquardt, under
+the constraints themselves, which IPOPT solves. All points after the first thus satisfy them.
 
 **Constraints** are comparisons by name. A function takes a mapping of every parameter's name to its
 casadi symbol, in SI units, and returns comparisons::
@@ -13,27 +12,22 @@ casadi symbol, in SI units, and returns comparisons::
         p["pivot_sigma"] == p["seal_sigma"],
     ]
 
-Fixed parameters are included as numbers. ``<`` means ``<=``. casadi differentiates the constraints
-twice. An equality reduces the number of free parameters by one: the covariance is that of the
-estimate on the constraint. An inequality that holds with equality acts as a bound; the covariance
-is that without it.
-
-**Coordinates.** Search coordinates relative to the start, scaled so that a unit step changes the
-residuals by their rms, so that nothing depends on physical units.
+Fixed parameters are included as numbers. ``<`` means ``<=``. An equality reduces the number of free
+parameters by one: the covariance is that of the estimate on the constraint. An inequality that
+holds with equality acts as a bound; the covariance is that without it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import null_space
 
-from dahl_ident.arrays import BoolArray, FloatArray, finite_array, non_negative_array
+from dahl_ident.arrays import BoolArray, FloatArray
 from dahl_ident.errors import FitError, ModelError, ValidationError, argument
 from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima
@@ -56,14 +50,17 @@ from dahl_ident.problem import Problem, Quadratic, TableProblem
 if TYPE_CHECKING:
     import casadi as ca
 
-_TOLERANCE = 1e-11  # gradient over the sum of squares at which IPOPT ends
-_ITERATIONS = 300  # IPOPT takes ten to thirty steps; a search that needs more does not converge
+_TOLERANCE = 1e-11  # gradient, in units of the noise, at which IPOPT ends
+_ITERATIONS = 300  # IPOPT takes ten to thirty steps; one that needs more does not converge
+_STEPS = 100  # most steps of a search, which takes one or two from an optimum
+_SHORT = 1e-8  # length of a step, in standard errors, at which a search has converged
+_STALLED = 1e-2  # the same where the cost does not fall, to the accuracy of predictions
+_FIRST_DAMPING = 1e-9  # almost a Gauss-Newton step
+_LEAST_DAMPING, _FIRM = 1e-6, 1e-3  # where the cost has not fallen; where it should have
+_EASING = 0.1  # factor on the damping after a step that lowers the cost
 # least rms residual over the largest change by a parameter, for the units of data without noise
 _LEAST_RESIDUAL = 1e-4
-_LN_STEP = 1e-4  # of ln p, for differences of gradients
 _MOST_STARTS = 6  # of the global grid and the user
-_FACTORS = (1.0, 0.01, 100.0)  # of the data's sizes, from which constraints alone are satisfied
-_PROXIMITY = 1e-6  # weight of the distance from there
 _SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 _INFEASIBLE = "Infeasible_Problem_Detected"
 _SILENT: dict[str, Any] = {
@@ -76,16 +73,10 @@ _WORDS = {
     _INFEASIBLE: "it found no way to satisfy the constraints",
     "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
     "Restoration_Failed": "it could not return to a point that satisfies the constraints",
-    "Diverging_Iterates": "a parameter diverged",
-    "Search_Direction_Becomes_Too_Small": "its steps became too small",
-    "Invalid_Number_Detected": "the model or a constraint gave an invalid number",
-    "Error_In_Step_Computation": "it could not compute a step",
+    "Invalid_Number_Detected": "a constraint gave an invalid number",
     "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns",
 }
 
-
-_Compute = Callable[[bytes, int], FloatArray]
-"""Derivative of the cost, from the bytes of a vector and the order of the derivative."""
 Constraints = Callable[[Mapping[str, "ca.SX"]], Iterable["ca.SX"]]
 """The user's function of constraints; see the docstring of this module."""
 _EXAMPLE = "lambda p: [p['f_max'] <= 1e-3 * p['sigma']]"
@@ -110,8 +101,8 @@ class Relations:
         free = ca.vertcat(*(symbols[name] for name in problem.names))
         texts, equal, differences = [], [], []
         for index, item in enumerate(_comparisons(constraints, symbols)):
-            relation = _comparison_code(item)
-            if relation is None:
+            is_scalar = isinstance(item, ca.SX) and item.is_scalar()
+            if not (is_scalar and any(map(item.is_op, (ca.OP_LE, ca.OP_LT, ca.OP_EQ)))):
                 raise ValidationError(
                     f"constraints[{index}] is {item!r}; expected a comparison with <=, >= or == "
                     "such as p['f_max'] <= 1e-3 * p['sigma']"
@@ -123,7 +114,7 @@ class Relations:
                     f"{', '.join(problem.names)}"
                 )
             texts.append(str(item).removeprefix("(").removesuffix(")"))
-            equal.append(relation == ca.OP_EQ)
+            equal.append(bool(item.is_op(ca.OP_EQ)))
             differences.append(difference)
         if not differences:
             return cls((), (), None)
@@ -145,31 +136,6 @@ class Relations:
                 values.append(ca.SX(float(parameter.value or 0.0)))
         differences: ca.SX = self.differences.call(values)[0]
         return differences
-
-    def check(self, problem: Problem) -> None:
-        """Raise if no parameters satisfy the constraints, whatever the data."""
-        import casadi as ca
-
-        if self.differences is None:
-            return
-        sizes = np.array([np.median(problem.unit_sizes(p.dimension)) for p in problem.parameters])
-        low, high = problem.bounds()
-        for factor in _FACTORS:
-            start = np.clip(problem.to_search(factor * sizes), low, high)
-            unit = np.where(problem.space.positive, 1.0, factor * sizes)
-            xi = ca.SX.sym("xi", start.size)
-            relations = self.at(problem, ca.DM(start) + ca.DM(unit) * xi)
-            nlp = {"x": xi, "f": _PROXIMITY * ca.sumsqr(xi), "g": relations}
-            solver = ca.nlpsol("ipopt", "ipopt", nlp, _SILENT)
-            least = np.where(self.equal, 0.0, -np.inf)
-            bounds = {"lbx": (low - start) / unit, "ubx": (high - start) / unit}
-            solver(x0=0.0, lbg=least, ubg=0.0, **bounds)
-            if str(solver.stats()["return_status"]) != _INFEASIBLE:
-                return
-        raise FitError(
-            f"no parameters satisfy the constraints {'; '.join(self.texts)} within the bounds: "
-            "relax one of them"
-        )
 
 
 class _Symbols(dict[str, "ca.SX"]):
@@ -198,15 +164,6 @@ def _comparisons(constraints: Constraints, symbols: _Symbols) -> list[Any]:
             f"constraints returned {relations!r}; expected a list of comparisons: {_EXAMPLE}"
         )
     return list(relations)
-
-
-def _comparison_code(item: Any) -> int | None:
-    """Return casadi's code of a comparison of two scalars, None for anything else."""
-    import casadi as ca
-
-    if not isinstance(item, ca.SX) or not item.is_scalar():
-        return None
-    return next((op for op in (ca.OP_LE, ca.OP_LT, ca.OP_EQ) if item.is_op(op)), None)
 
 
 def solve_ipopt(
@@ -247,7 +204,6 @@ def solve_ipopt(
     if drive_std is not None or drive_covariance is not None:
         problem = _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
-    relations.check(problem)
     # without constraints, the start is that without errors of the drive, which is far quicker
     begin = solve(problem if relations.texts else plain, loss=loss, start=start, tell=tell)
     if begin.status.at_infinity and not relations.texts and problem is plain:
@@ -318,80 +274,72 @@ class _Descent:
         ends += [self.descend(theta) for theta in starts if np.isfinite(self.at(theta).cost)]
         if not ends:
             raise FitError("no start has a steady response in every row; give another start")
-        best = min(ends, key=lambda e: (bool(e.failure), e.cost))
-        again = best if best.failure else self.descend(best.theta)  # in the units of the optimum
-        return best if again.failure else again
+        if all(end.failure == _WORDS[_INFEASIBLE] for end in ends):
+            raise FitError(
+                f"no parameters satisfy the constraints {'; '.join(self.relations.texts)} within "
+                "the bounds: relax one of them"
+            )
+        return min(ends, key=lambda e: (bool(e.failure), e.cost))
 
     def descend(self, start: FloatArray) -> _End:
-        """Run IPOPT from `start`."""
+        """Return the end of a search from `start`."""
+        equal = np.array(self.relations.equal, dtype=np.bool_)
+        solver, slopes_at = self._solver(start.size)
+        theta, at, is_allowed = start, self.at(start), not equal.size
+        damping, active, failure = _FIRST_DAMPING, np.zeros_like(equal), "it took too many steps"
+        for _ in range(_STEPS):
+            noise, unit = self._units(theta, at)
+            hessian = at.hessian * np.outer(unit, unit) / noise + damping * np.eye(theta.size)
+            size = np.linalg.norm(np.asarray(slopes_at(theta)) * unit, axis=1)
+            size[~np.isfinite(size) | (size == 0.0)] = 1.0
+            low, high = ((bound - theta) / unit for bound in self.problem.bounds())
+            known = [theta, unit, at.gradient * unit / noise, hessian.ravel(), size]
+            least = np.where(equal, 0.0, -np.inf)
+            solution = solver(x0=0.0, p=np.hstack(known), lbx=low, ubx=high, lbg=least, ubg=0.0)
+            status = str(solver.stats()["return_status"])
+            if status not in _SOLVED:
+                failure = _WORDS.get(status, status.replace("_", " ").lower())
+                break
+            step, *pairs = (np.asarray(solution[key]).ravel() for key in ("x", "g", "lam_g"))
+            # distance or multiplier is zero, to a tolerance that differs between problems
+            active = ~equal & (pairs[1] > -pairs[0])
+            new, length = self.at(theta + unit * step), float(np.sqrt(step @ hessian @ step))
+            self.evaluations += 1
+            falls = bool(new.cost <= at.cost or (np.isfinite(new.cost) and not is_allowed))
+            if falls:
+                theta, at, is_allowed = theta + unit * step, new, True
+            if length <= (_SHORT if falls or damping < _FIRM else _STALLED):
+                failure = ""
+                break
+            damping = damping * _EASING if falls else max(damping, _LEAST_DAMPING) / _EASING
+        slopes = np.asarray(slopes_at(theta))
+        return _End(theta, float(at.cost), failure, slopes, tuple(active.tolist()))
+
+    def _solver(self, P: int) -> tuple[ca.Function, ca.Function]:
+        """Return IPOPT for one step in units, and the derivatives of the constraints."""
         import casadi as ca
 
-        equal, (unit, weight, tolerance, step) = self.relations.equal, self._units(start)
+        theta, unit, gradient, step = (ca.SX.sym(name, P) for name in ("theta", "u", "g", "step"))
+        hessian, size = ca.SX.sym("hessian", P, P), ca.SX.sym("size", len(self.relations.texts))
+        at_theta = self.relations.at(self.problem, theta)
+        nlp = {
+            "x": step,
+            "p": ca.vertcat(theta, unit, gradient, ca.vec(hessian), size),
+            "f": ca.dot(gradient, step) + 0.5 * ca.bilin(hessian, step, step),
+            "g": self.relations.at(self.problem, theta + unit * step) / size,
+        }
+        options = {**_SILENT, "ipopt.tol": _TOLERANCE, "ipopt.max_iter": _ITERATIONS}
+        slopes = ca.Function("slopes", [theta], [ca.jacobian(at_theta, theta)])
+        return ca.nlpsol("ipopt", "ipopt", nlp, options), slopes
 
-        @lru_cache(maxsize=1)  # IPOPT calls for the cost and the gradient in turn
-        def at(xi: bytes) -> Quadratic:
-            return self.at(start + unit * np.frombuffer(xi))
-
-        def computed(xi: bytes, order: int) -> FloatArray:
-            if order < 2:
-                return 2.0 * weight * (at(xi).gradient * unit if order else at(xi).cost)
-            steps = np.vstack([np.zeros(start.size), np.diag(step)])
-            near = self.at(start + unit * (np.frombuffer(xi) + steps))
-            hessian = (near.gradient[1:] - near.gradient[0]) / step[:, None] * unit
-            if not np.isfinite(hessian).all():
-                hessian = near.hessian[0] * np.outer(unit, unit)
-            return np.asarray(weight * (hessian + hessian.T))
-
-        xi = ca.SX.sym("xi", start.size)
-        differences = self.relations.at(self.problem, ca.DM(start) + ca.DM(unit) * xi)
-        slopes = ca.Function("slopes", [xi], [ca.jacobian(differences, xi)])
-        size = np.linalg.norm(np.asarray(slopes(0.0)), axis=1)
-        size[~np.isfinite(size) | (size == 0.0)] = 1.0
-        constraints = ca.Function("constraints", [xi], [differences / ca.DM(size)])
-        low, high = ((bound - start) / unit for bound in self.problem.bounds())
-        bounded = not all(equal) or bool(np.isfinite([low, high]).any())
-        cost, x = _cost_class()(computed, start.size), ca.MX.sym("x", start.size)
-        solver = ca.nlpsol(
-            "ipopt",
-            "ipopt",
-            {"x": x, "f": cost(x), "g": constraints(x)},
-            {
-                **_SILENT,
-                "ipopt.tol": tolerance,
-                "ipopt.max_iter": _ITERATIONS,
-                "ipopt.nlp_scaling_method": "none",
-                "ipopt.bound_relax_factor": 0.0,
-                "ipopt.mu_init": 1e-3 if bounded else tolerance,
-            },
-        )
-        least = np.where(equal, 0.0, -np.inf)
-        solution = solver(x0=0.0, lbx=low, ubx=high, lbg=least, ubg=0.0)
-        stats = solver.stats()
-        self.evaluations += int(stats["n_call_nlp_f"])
-        status = str(stats["return_status"])
-        failure = "" if status in _SOLVED else _WORDS.get(status, status.replace("_", " ").lower())
-        end, *pairs = (np.asarray(solution[key]).ravel() for key in ("x", "g", "lam_g"))
-        # distance or multiplier is zero, to a tolerance that differs between problems
-        active = tuple(not e and bool(m > -c) for e, c, m in zip(equal, *pairs, strict=True))
-        cost_at_end = 0.5 * float(solution["f"]) / weight
-        return _End(
-            start + unit * end, cost_at_end, failure, np.asarray(slopes(end)) / unit, active
-        )
-
-    def _units(self, start: FloatArray) -> tuple[FloatArray, float, float, FloatArray]:
-        """Return the units of the coordinates xi, the factor of the cost, tolerance, and steps.
-
-        The tolerance is that of the gradient, and the steps of xi are for its differences.
-        """
-        problem, at = self.problem, self.at(start)
-        m = problem.n_residuals + len(problem.priors)
-        slope = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0) / m)  # rms of the residuals'
+    def _units(self, theta: FloatArray, at: Quadratic) -> tuple[float, FloatArray]:
+        """Return the variance of the noise, and steps that change the residuals by as much."""
+        m = self.problem.n_residuals + len(self.problem.priors)
+        slope = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0))
         slope = np.where((slope > 0.0) & np.isfinite(slope), slope, 1.0)
-        largest = np.max(slope * np.where(problem.space.positive, 1.0, np.abs(start)))
-        residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(largest))
-        rounding = float(problem.rounding) / self.scale / residual
-        step = _LN_STEP * np.where(problem.space.positive, 1.0, largest / slope) * slope / residual
-        return residual / slope, 0.5 / (m * residual**2), max(_TOLERANCE, rounding), step
+        largest = np.max(slope * np.where(self.problem.space.positive, 1.0, np.abs(theta)))
+        noise = max(2.0 * float(at.cost), (_LEAST_RESIDUAL * float(largest)) ** 2) / m
+        return noise, noise**0.5 / slope
 
     def optimum(self, end: _End, begin: Optimum) -> Optimum:
         """Return the optimum with status, message and covariance."""
@@ -469,52 +417,6 @@ class _Descent:
         return ConstraintCost(texts, rise, dof)
 
 
-@cache
-def _cost_class() -> Any:
-    """Return the class of casadi functions whose values and derivatives numpy computes."""
-    import casadi as ca
-
-    class Computed(ca.Callback):
-        """The cost of a vector (order 0), its gradient, a row (1), or its Hessian (2).
-
-        As casadi requires, a derivative also takes the value of its function, and ignores it.
-        """
-
-        def __init__(self, compute: _Compute, size: int, order: int = 0) -> None:
-            ca.Callback.__init__(self)
-            self._compute, self._order = compute, order
-            self._shapes = [(size, 1), (1, 1), (1, size), (size, size)]
-            self._derivative = Computed(compute, size, order + 1) if order < 2 else None
-            self.construct("computed", {})
-
-        def get_n_in(self) -> int:
-            return 1 + self._order
-
-        def get_n_out(self) -> int:
-            return max(1, self._order)
-
-        def get_sparsity_in(self, which: int) -> Any:
-            shape = self._shapes[which]
-            return ca.Sparsity(*shape) if which else ca.Sparsity.dense(*shape)
-
-        def get_sparsity_out(self, which: int) -> Any:
-            shape = self._shapes[1 + self._order]
-            return ca.Sparsity(shape[0], 1) if which else ca.Sparsity.dense(*shape)
-
-        def has_jacobian(self) -> bool:
-            return self._derivative is not None
-
-        def get_jacobian(self, *_: Any) -> Any:
-            return self._derivative
-
-        def eval(self, arguments: Any) -> Any:
-            at = np.asarray(arguments[0]).tobytes()
-            value = ca.DM(np.atleast_2d(self._compute(at, self._order)))
-            return [value, *(ca.DM(self.sparsity_out(i)) for i in range(1, self.n_out()))]
-
-    return Computed
-
-
 def _with_drive_error(
     problem: TableProblem, loss: str, std: ArrayLike | None, covariance: ArrayLike | None
 ) -> TableProblem:
@@ -535,19 +437,13 @@ def _with_drive_error(
             "in addition to the response's error is known only with "
             f"{argument('noise', 'measured')}, {argument('loss', 'linear')}"
         )
-    spread = _for_rows(non_negative_array(std, "drive_std"), "drive_std", (data.n,))
-    cross = None
-    if covariance is not None:
-        cross = finite_array(covariance, "drive_covariance")
-        cross = _for_rows(cross, "drive_covariance", (data.n, 2))
-    noisy = replace(data, drive_std=spread, drive_covariance=cross)
-    return problem.like(data=noisy)
-
-
-def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArray:
-    if value.shape not in ((), shape):
-        raise ValidationError(f"{name} has shape {value.shape}; expected one number or {shape}")
-    return np.broadcast_to(value, shape)
+    columns: dict[str, Any] = {
+        "drive_std": std if np.ndim(std) else np.full(data.n, std),
+        "drive_covariance": covariance,
+    }
+    if covariance is not None and not np.ndim(covariance):
+        columns["drive_covariance"] = np.full((data.n, 2), covariance)
+    return problem.like(data=replace(data, **columns))
 
 
 def _on_constraints(information: FloatArray, slopes: FloatArray) -> tuple[FloatArray, BoolArray]:
