@@ -13,7 +13,7 @@ from dahl_ident.control_interop import (
     response_branches,
 )
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.synthetic.mechanism import Mechanism
+from dahl_ident.synthetic.mechanism import displacement_under
 from dahl_ident.synthetic.waveform import WaveformBuilder
 
 # FrictionNonlinearity inside python-control: signs, memory, intersections.
@@ -174,7 +174,7 @@ def staircase(plant, drives, frequency_hz, hold):
         builder.stay((hold - 4) / frequency_hz)
         builder.measure(4 / frequency_hz)
     force = builder.finish()
-    x = Mechanism.of(plant).displacement_under(force)
+    x = displacement_under(plant, force)
     amplitudes = []
     for window in force.windows:
         time = window.start + np.arange(2048) / 2048.0 * (window.stop - window.start)

@@ -15,7 +15,7 @@ from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring
 from dahl_ident.control_interop import FrictionNonlinearity, LimitCycle, limit_cycles
 from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.synthetic.mechanism import Mechanism
+from dahl_ident.synthetic.mechanism import displacement_under
 from dahl_ident.synthetic.waveform import WaveformBuilder
 
 s = control.tf("s")
@@ -40,7 +40,7 @@ def turning_points(loop, friction, kick, frequency_hz, duration):
     builder.stay(duration)
     force = builder.finish()
     time = np.arange(0.0, force.duration, 1.0 / (200.0 * frequency_hz))
-    x = Mechanism.of(plant).displacement_under(force)(time)
+    x = displacement_under(plant, force)(time)
     turns = 1 + np.flatnonzero((x[1:-1] - x[:-2]) * (x[2:] - x[1:-1]) < 0.0)
     turns = turns[time[turns] > 4.0 / frequency_hz]
     return time[turns], x[turns]

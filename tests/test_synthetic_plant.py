@@ -7,7 +7,7 @@ import pytest
 from dahl_ident import BoucWen, Dahl, Damper, LinearSystem, Mass, Model, Spring, response
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
-from dahl_ident.synthetic.mechanism import Mechanism
+from dahl_ident.synthetic.mechanism import displacement_under, force_under
 
 FRICTION = (0.1, 30.0)
 LINEAR = Mass(0.3) + Damper(0.24) + Spring(0.3)
@@ -20,8 +20,8 @@ def test_motion_of_a_law_without_closed_form(levels):
     steps = SteppedSine(levels, (0.7,), controlled="force", settling_periods=1, num_periods=1)
     force = steps.waveform(seed=0)
     time = np.linspace(0.0, force.duration, 997)
-    exact = Mechanism.of(Dahl(0.1, 30.0) + LINEAR).displacement_under(force)(time)
-    motion = Mechanism.of(BoucWen(30.0, 300.0, 300.0) + LINEAR).displacement_under(force)(time)
+    exact = displacement_under(Dahl(0.1, 30.0) + LINEAR, force)(time)
+    motion = displacement_under(BoucWen(30.0, 300.0, 300.0) + LINEAR, force)(time)
     assert np.max(np.abs(motion - exact)) < 1e-5 * np.max(np.abs(exact))
 
 
@@ -46,7 +46,7 @@ def phasor(signal, frequency_hz, start, periods, k=1):
 @pytest.mark.parametrize("level", [0.05, 0.5])
 def test_forces_balance_at_every_instant(plant, level):
     force = AmplitudeRamp(0.3 * level, level, 1.0, 3.0, controlled="force").waveform(seed=0)
-    motion = Mechanism.of(plant).displacement_under(force)
+    motion = displacement_under(plant, force)
     time = np.linspace(0.0, force.duration, 20_001)
     x = motion(time)
     v = np.gradient(x, time, edge_order=2)
@@ -64,7 +64,7 @@ def test_a_plant_without_mass_follows_a_jump_of_the_force(law, plant):
     sweep = FrequencySweep((0.05, 0.3), 1.0, 1.37, 2.3, ramp_periods=0.0)
     force = sweep.waveform(seed=0)
     time = np.linspace(0.0, force.duration, 20_001)
-    x = Mechanism.of(law + plant).displacement_under(force)(time)
+    x = displacement_under(law + plant, force)(time)
     total = (law + plant).force(x, velocity=np.gradient(x, time))
     assert np.quantile(np.abs(total - force.value(time)), 0.99) < 1e-4
 
@@ -88,8 +88,8 @@ def test_a_linear_system_moves_as_its_elements_do(system, quantity, controlled):
     time = np.linspace(0.0, wave.duration, 500)
     plants = [PLANT, Dahl(*FRICTION) + LinearSystem(system, quantity=quantity)]
     elements, lumped = (
-        (m.displacement_under if controlled == "force" else m.force_under)(wave)(time)
-        for m in map(Mechanism.of, plants)
+        (displacement_under if controlled == "force" else force_under)(plant, wave)(time)
+        for plant in plants
     )
     assert lumped == pytest.approx(elements, abs=1e-10 * np.max(np.abs(elements)))
 
@@ -101,16 +101,15 @@ def test_a_linear_system_with_poles_of_its_own_is_followed_under_either_control(
         quantity="dynamic_stiffness",
     )
     plant = PLANT + absorber
-    mechanism = Mechanism.of(plant)
     f = 0.9
     held = SteppedSine((0.01,), (f,), settling_periods=20).waveform(seed=0)
     start = held.windows[0].start
-    stiffness = phasor(mechanism.force_under(held), f, start, 5) / phasor(held.value, f, start, 5)
+    stiffness = phasor(force_under(plant, held), f, start, 5) / phasor(held.value, f, start, 5)
     # 512 samples a period alias friction's corners a little
     assert stiffness == pytest.approx(plant.dynamic_stiffness(0.01, 2.0 * np.pi * f), rel=1e-6)
     driven = SteppedSine((0.02,), (4.0,), controlled="force", settling_periods=60).waveform(seed=0)
     start = driven.windows[0].start
-    x = mechanism.displacement_under(driven)
+    x = displacement_under(plant, driven)
     receptance = phasor(x, 4.0, start, 5) / phasor(driven.value, 4.0, start, 5)
     assert receptance == pytest.approx(complex(response(plant, 4.0, 0.02).receptance), rel=1e-3)
 
@@ -124,7 +123,7 @@ def test_friction_under_a_held_displacement_is_the_exact_force(alpha, amplitude)
     ).waveform(seed=0)
     rng = np.random.Generator(np.random.PCG64(1))
     time = np.sort(rng.uniform(0.0, wave.duration, 300))
-    force = Mechanism.of(friction).force_under(wave)(time)
+    force = force_under(friction, wave)(time)
     dense = np.unique(np.concatenate([time, wave.turning_times()]))
     expected = friction.force(wave.value(dense))[np.searchsorted(dense, time)]
     assert force == pytest.approx(expected, abs=1e-13 * 0.1)
@@ -132,20 +131,19 @@ def test_friction_under_a_held_displacement_is_the_exact_force(alpha, amplitude)
 
 def test_time_can_be_scaled():
     slow, fast = (
-        Mechanism.of(Dahl(*FRICTION) + Mass(0.3 * s**2) + Damper(0.24 * s) + Spring(0.3))
-        for s in (1.0, 1e-4)
+        Dahl(*FRICTION) + Mass(0.3 * s**2) + Damper(0.24 * s) + Spring(0.3) for s in (1.0, 1e-4)
     )
     time = np.linspace(0.0, 8.0, 301)
     runs = [FrequencySweep(0.08, 0.5 / s, 1.0 / s, 4.0 * s).waveform(seed=0) for s in (1.0, 1e-4)]
-    x = slow.displacement_under(runs[0])(time)
-    y = fast.displacement_under(runs[1])(time * 1e-4)
+    x = displacement_under(slow, runs[0])(time)
+    y = displacement_under(fast, runs[1])(time * 1e-4)
     assert y == pytest.approx(x, abs=1e-9 * np.max(np.abs(x)))
 
 
 def test_progress_rises_to_one():
     seen: list[float] = []
     wave = SteppedSine((0.1, 0.2), controlled="force", settling_periods=1).waveform(seed=0)
-    Mechanism.of(PLANT).displacement_under(wave, seen.append)
+    displacement_under(PLANT, wave, seen.append)
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
     assert len(seen) == len(wave.segments)
@@ -173,17 +171,17 @@ def test_progress_rises_to_one():
 def test_a_plant_without_motion_says_why(plant, message):
     wave = SteppedSine((0.1,), controlled="force").waveform(seed=0)
     with pytest.raises(ModelError, match=message):
-        Mechanism.of(plant).displacement_under(wave)
+        displacement_under(plant, wave)
 
 
 def test_an_unstable_plant_says_so():
     wave = SteppedSine((0.1,), controlled="force", settling_periods=2000).waveform(seed=0)
     with pytest.raises(ModelError, match="the motion grows beyond all bounds"):
-        Mechanism.of(Dahl(*FRICTION) + Mass(0.3) + Damper(-5.0)).displacement_under(wave)
+        displacement_under(Dahl(*FRICTION) + Mass(0.3) + Damper(-5.0), wave)
 
 
 def test_a_stiffness_beyond_a_mass_has_no_force_under_a_held_displacement():
     jerk = LinearSystem(control.tf([1.0], [1.0, 0.0, 0.0, 0.0]), quantity="receptance")
     wave = SteppedSine((0.1,)).waveform(seed=0)
     with pytest.raises(ModelError, match=r"grows as s\^3; under a prescribed displacement"):
-        Mechanism.of(jerk).force_under(wave)
+        force_under(jerk, wave)

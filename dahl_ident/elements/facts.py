@@ -66,25 +66,10 @@ class Path(NamedTuple):
         They belong to powers of the fraction of an interval; `intervals` are in s. The polynomials
         have the velocities, and the accelerations where known, of both ends (Hermite).
         """
-        x, v, a = self.displacement, np.asarray(self.velocity), self.acceleration
-        c1, slope = intervals * v[:-1], intervals * v[1:]
-        if a is None:
-            dx, dv = np.diff(x) - c1, slope - c1
-            return np.stack([x[:-1], c1, 3.0 * dx - dv, dv - 2.0 * dx])
-        c2 = 0.5 * intervals**2 * a[:-1]
-        dx = np.diff(x) - c1 - c2
-        dv = slope - c1 - 2.0 * c2
-        da = 0.5 * intervals**2 * a[1:] - c2
-        return np.stack(
-            [
-                x[:-1],
-                c1,
-                c2,
-                10.0 * dx - 4.0 * dv + da,
-                -15.0 * dx + 7.0 * dv - 2.0 * da,
-                6.0 * dx - 3.0 * dv + da,
-            ]
-        )
+        from dahl_ident.engine.sampled import hermite  # the engine is slow to import
+
+        known = [v for v in self[:3] if v is not None]
+        return hermite(np.array(known), intervals)
 
 
 class StiffnessGradient(NamedTuple):

@@ -11,10 +11,18 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, complex128, float64, int64, njit, types
 
-from dahl_ident.engine.collocation import SHORTEST, STAGES
-from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR, compiled, eliminate
 from dahl_ident.engine.integrate import Asked, Scratch, advance
 from dahl_ident.engine.radau import LAYOUT, Signal, at_unit_velocity, put_parameters, restart
+from dahl_ident.engine.stages import (
+    FUNCTION,
+    NUMBERS,
+    SHORTEST,
+    STAGES,
+    TABLE,
+    VECTOR,
+    compiled,
+    eliminate,
+)
 
 _SHOTS = 40  # of shooting; five are typical
 # Changes of the initial states over the largest states:

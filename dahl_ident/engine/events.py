@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dahl_ident.engine.collocation import POSITIONS, STAGES, VALUE_AT
-from dahl_ident.engine.compiling import compiled
 from dahl_ident.engine.radau import (
     NEAR,
     evaluate,
@@ -20,6 +18,7 @@ from dahl_ident.engine.radau import (
     signal_at,
     solve_stages,
 )
+from dahl_ident.engine.stages import POSITIONS, STAGES, VALUE_AT, compiled
 
 LOCATED = 1e-13  # of the span: shorter steps, and smaller differences of time, count as zero
 # Distances to a limit over that at the beginning of a step, and over the largest one:

@@ -9,8 +9,6 @@ from collections import namedtuple
 
 import numpy as np
 
-from dahl_ident.engine.collocation import MATRIX, NODES, SLOPE_AFTER, STAGES
-from dahl_ident.engine.compiling import compiled
 from dahl_ident.engine.events import (
     LOCATED,
     choose_branch,
@@ -38,6 +36,7 @@ from dahl_ident.engine.radau import (
     signal_at,
     solve_stages,
 )
+from dahl_ident.engine.stages import MATRIX, NODES, SLOPE_AFTER, STAGES, compiled
 
 _TURNING = 10.0  # factor on errors next to a turning point, where laws are least smooth
 _FAILED = 0.25  # factor on a step whose stages did not converge

@@ -15,8 +15,6 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, complex128, float64, njit, types
 
-from dahl_ident.engine.collocation import MATRIX, SHORTEST, STAGES
-from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR, compiled
 from dahl_ident.engine.loop_step import (
     Work,
     choose_sides,
@@ -33,6 +31,16 @@ from dahl_ident.engine.loop_step import (
     solve_stages,
 )
 from dahl_ident.engine.radau import GROW, SAFETY, SHRINK
+from dahl_ident.engine.stages import (
+    FUNCTION,
+    MATRIX,
+    NUMBERS,
+    SHORTEST,
+    STAGES,
+    TABLE,
+    VECTOR,
+    compiled,
+)
 
 _LOCATED = 1e-14  # rad: shorter steps count as zero
 _MOST = 500  # steps of a half cycle, in addition to those for the highest harmonic

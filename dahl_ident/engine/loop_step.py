@@ -12,7 +12,9 @@ from collections import namedtuple
 
 import numpy as np
 
-from dahl_ident.engine.collocation import (
+from dahl_ident.engine.events import DECADE, FADED, LEFT
+from dahl_ident.engine.radau import NEAR, SIDED, SOLVED
+from dahl_ident.engine.stages import (
     CHANGE_CHECKED,
     CHECKED,
     MATRIX,
@@ -22,10 +24,10 @@ from dahl_ident.engine.collocation import (
     STAGES,
     VALUE_AT,
     VALUE_BEFORE,
+    compiled,
+    eliminate,
+    remove_pole,
 )
-from dahl_ident.engine.compiling import compiled, eliminate, remove_pole
-from dahl_ident.engine.events import DECADE, FADED, LEFT
-from dahl_ident.engine.radau import NEAR, SIDED, SOLVED
 
 _NEWTON = 15  # iterations of the stages
 _FLOOR = 1e-6  # of the largest force: smaller local forces are no scale for errors

@@ -28,10 +28,7 @@ _LOOP = 1e-6  # of loops of laws with one state, over the local force
 _HELD = 10.0  # if the displacement is held: forces to 1e-9, and motions to 1e-8
 _RATED = 10.0  # if the law depends on the speed: it changes most near rest
 _CYCLES = 4  # from rest before Newton's method: a plant is then near its settled motion
-_KERNELS = (
-    *("collocation", "compiling", "radau", "events", "integrate", "samples", "cycle"),
-    *("loop_step", "loop"),
-)
+_KERNELS = ("stages", "radau", "events", "integrate", "samples", "cycle", "loop_step", "loop")
 
 
 class Settled(NamedTuple):

@@ -26,7 +26,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from dahl_ident.engine.collocation import (
+from dahl_ident.engine.stages import (
     CHECKED,
     FACTORS,
     MATRIX,
@@ -35,8 +35,11 @@ from dahl_ident.engine.collocation import (
     SLOPE_CHECKED,
     STAGES,
     VALUE_BEFORE,
+    compiled,
+    eliminate,
+    inlined,
+    remove_pole,
 )
-from dahl_ident.engine.compiling import compiled, eliminate, inlined, remove_pole
 
 SHRINK, GROW, SAFETY = 0.1, 6.0, 0.8  # limits and safety of the factor to the next step
 _STAGE_ITERATIONS = 20  # of the stages; two of Newton's method are typical

@@ -124,19 +124,29 @@ def band_limited(samples: FloatArray, interval: float) -> FloatArray:
     if not periodic:
         derivatives[0] = derivatives[0] + line
         derivatives[1] = derivatives[1] + (samples[-1] - samples[0]) / ((n - 1) * interval)
-    ends = np.array([interval**k * d for k, d in enumerate(derivatives)])
-    return np.asarray(_HERMITE @ np.vstack([ends[:, :-1], ends[:, 1:]]))
+    return hermite(np.array(derivatives), np.full(n - 1, interval))
 
 
-def _hermite() -> FloatArray:
-    """Return the matrix from derivatives at 0 and at 1 to a polynomial's coefficients."""
-    count = 2 * (_DERIVATIVES + 1)
-    powers, rows, factor = np.arange(count), [], np.ones(count)
-    for order in range(_DERIVATIVES + 1):
-        rows.append(factor * (powers == order))
-        rows.append(factor.copy())
+def hermite(derivatives: FloatArray, intervals: FloatArray) -> FloatArray:
+    """Return polynomials between samples that have the derivatives of both their ends.
+
+    Rows of `derivatives` are the samples and their derivatives, (d + 1, n); those of the result are
+    the coefficients of powers of the fraction of an interval, (2 d + 2, n - 1).
+
+    Examples
+    --------
+    >>> hermite(np.array([[0.0, 1.0], [1.0, 1.0]]), np.ones(1)).ravel().round(12).tolist()
+    [0.0, 1.0, 0.0, 0.0]
+    """
+    count = len(derivatives)
+    powers, rows, factor = np.arange(2 * count), [], np.ones(2 * count)
+    for order in range(count):
+        rows += [factor * (powers == order), factor]
         factor = factor * (powers - order)
-    return np.asarray(np.linalg.inv(np.array(rows[::2] + rows[1::2])))
-
-
-_HERMITE = _hermite()
+    scale = intervals ** np.arange(count)[:, None]
+    first, last = derivatives[:, :-1] * scale, derivatives[:, 1:] * scale
+    value = first[0].copy()
+    first[0], last[0] = 0.0, last[0] - value  # changes keep their digits
+    coefficients = np.linalg.inv(np.array(rows[::2] + rows[1::2])) @ np.vstack([first, last])
+    coefficients[0] = value
+    return np.asarray(coefficients)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import float64, int64, njit, types
 
-from dahl_ident.engine.collocation import STAGES
-from dahl_ident.engine.compiling import FUNCTION, NUMBERS, TABLE, VECTOR
 from dahl_ident.engine.integrate import Asked, Scratch, advance
 from dahl_ident.engine.radau import LAYOUT, Signal, put_parameters, restart
+from dahl_ident.engine.stages import FUNCTION, NUMBERS, STAGES, TABLE, VECTOR
 
 
 @njit(

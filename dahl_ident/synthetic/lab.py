@@ -16,7 +16,7 @@ from dahl_ident.errors import ModelError, NoSteadyMotionWarning, ValidationError
 from dahl_ident.synthetic.acquisition import Draws, Table
 from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
-from dahl_ident.synthetic.mechanism import Mechanism, Progress, Signal
+from dahl_ident.synthetic.mechanism import Progress, Signal, displacement_under, force_under
 
 GENERATOR = "dahl_ident.synthetic 3"
 """Version of the generator; it changes whenever an experiment and seed would give other values."""
@@ -88,13 +88,12 @@ def simulate(
         )
     waveform = excitation.waveform(seed)
     provenance["windows"] = [list(window) for window in waveform.windows]
-    mechanism = Mechanism.of(experiment.plant)
     displacement: Signal = waveform.value
     force: Signal = waveform.value
     if excitation.controlled == "force":
-        displacement = mechanism.displacement_under(waveform, progress)
+        displacement = displacement_under(experiment.plant, waveform, progress)
     else:
-        force = mechanism.force_under(waveform, progress)
+        force = force_under(experiment.plant, waveform, progress)
     times = acquisition.sampling_times(waveform.duration, waveform.highest_frequency_hz)
     time, x, F = acquisition.record(displacement, force, times, draws)
     return Record(time, displacement=x, force=F, motion=experiment.motion, provenance=provenance)

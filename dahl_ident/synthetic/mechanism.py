@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,87 +30,73 @@ Progress = Callable[[float], None]
 """Called with the completed fraction of a simulation."""
 
 
-@dataclass(frozen=True)
-class Mechanism:
-    """A model whose parameters all have values, and its linear part n(s)/d(s)."""
+def displacement_under(plant: Element, force: Waveform, progress: Progress | None = None) -> Signal:
+    """Return x(t) of a plant with known parameters for a force u(t), from rest."""
+    plant = as_model(plant)
+    if not plant.has_inertia:
+        return _without_mass(plant, force, progress)
+    try:
+        return EngineMotion(plant_equations(plant), _values(plant), force, progress)
+    except FitError as error:
+        raise ModelError(
+            "the motion grows beyond all bounds; the plant has no steady state under this "
+            "force: control the displacement"
+        ) from error
 
-    plant: Model
-    laws: tuple[Element, ...]
-    """The elements that are not linear."""
-    linear: Rational
 
-    @classmethod
-    def of(cls, plant: Element) -> Mechanism:
-        """Return the parts of a model."""
-        plant.known_values()
-        plant = as_model(plant)
-        laws = []
-        linear = Rational(np.zeros(1), np.ones(1))
-        for element in plant.elements:
-            rational = element.rational_stiffness()
-            if rational is None:
-                laws.append(element)
-            else:
-                linear = linear + Rational(*rational).trimmed()
-        return cls(plant, tuple(laws), linear)
+def _without_mass(plant: Model, force: Waveform, progress: Progress | None) -> Signal:
+    """Return x(t) of friction with a spring, a damper or both."""
+    laws, linear = _parts(plant)
+    polynomial, proper = linear.split()
+    if not np.any(linear.numerator):
+        raise ModelError(
+            "friction alone slides without bound under a force above f_max; give the plant a "
+            "mass, a damper or a spring, or control its displacement"
+        )
+    if np.any(proper.numerator) or not all(law.rate_independent for law in laws):
+        raise ModelError(
+            f"{plant!r} has no state-space form; give the plant a mass, or control its displacement"
+        )
+    stiffness, damping = [*polynomial[::-1].tolist(), 0.0][:2]
+    equations = _massless(laws, stiffness, damping)
+    return EngineMotion(equations, (), force, progress, damping=damping)
 
-    def displacement_under(self, force: Waveform, progress: Progress | None = None) -> Signal:
-        """Return x(t) for a force u(t), from rest."""
-        if not self.plant.has_inertia:
-            return self._without_mass(force, progress)
-        try:
-            equations = plant_equations(self.plant)
-            return EngineMotion(equations, _values(self.plant), force, progress)
-        except FitError as error:
-            raise ModelError(
-                "the motion grows beyond all bounds; the plant has no steady state under this "
-                "force: control the displacement"
-            ) from error
 
-    def _without_mass(self, force: Waveform, progress: Progress | None) -> Signal:
-        """Return x(t) of friction with a spring, a damper or both."""
-        polynomial, proper = self.linear.split()
-        if not np.any(self.linear.numerator):
-            raise ModelError(
-                "friction alone slides without bound under a force above f_max; give the plant a "
-                "mass, a damper or a spring, or control its displacement"
-            )
-        if np.any(proper.numerator) or any(
-            not getattr(law, "rate_independent", False) for law in self.laws
-        ):
-            raise ModelError(
-                f"{self.plant!r} has no state-space form; give the plant a mass, or control its "
-                "displacement"
-            )
-        stiffness, damping = [*polynomial[::-1].tolist(), 0.0][:2]
-        equations = _massless(self.laws, stiffness, damping)
-        return EngineMotion(equations, (), force, progress, damping=damping)
+def force_under(plant: Element, displacement: Waveform, progress: Progress | None = None) -> Signal:
+    """Return the force F(t) of a plant with known parameters for a displacement, from rest."""
+    laws, linear = _parts(as_model(plant))
+    polynomial, proper = linear.split()
+    if polynomial.size > 3:
+        raise ModelError(
+            f"the linear part's dynamic stiffness grows as s^{polynomial.size - 1}; under a "
+            "prescribed displacement at most s^2, a mass, has a force"
+        )
+    parts: list[Signal] = [_law_force(law, displacement) for law in laws]
+    if np.any(proper.numerator):
+        import control
 
-    def force_under(self, displacement: Waveform, progress: Progress | None = None) -> Signal:
-        """Return the force F(t) for a displacement x(t), from rest."""
-        polynomial, proper = self.linear.split()
-        if polynomial.size > 3:
-            raise ModelError(
-                f"the linear part's dynamic stiffness grows as s^{polynomial.size - 1}; under a "
-                "prescribed displacement at most s^2, a mass, has a force"
-            )
-        q0, q1, q2 = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
-        parts: list[Signal] = [_law_force(law, displacement) for law in self.laws]
-        if np.any(proper.numerator):
-            import control
+        system = control.tf(proper.numerator, proper.denominator)
+        element = LinearSystem(system, quantity="dynamic_stiffness")
+        parts.append(EngineMotion(law_equations(element), (), displacement, progress))
 
-            system = control.tf(proper.numerator, proper.denominator)
-            element = LinearSystem(system, quantity="dynamic_stiffness")
-            parts.append(EngineMotion(law_equations(element), (), displacement, progress))
+    def force(time: FloatArray) -> FloatArray:
+        motion = displacement.motion(time)
+        terms = [q * part for q, part in zip(polynomial[::-1], motion, strict=False)]
+        return np.asarray(sum(terms) + sum(part(time) for part in parts))
 
-        def force(time: FloatArray) -> FloatArray:
-            motion = displacement.motion(time)
-            total = q0 * motion.value + q1 * motion.velocity + q2 * motion.acceleration
-            for part in parts:
-                total = total + part(time)
-            return np.asarray(total)
+    return force
 
-        return force
+
+def _parts(plant: Model) -> tuple[list[Element], Rational]:
+    """Return the elements that are not linear, and the linear part n(s)/d(s)."""
+    laws, linear = [], Rational(np.zeros(1), np.ones(1))
+    for element in plant.elements:
+        rational = element.rational_stiffness()
+        if rational is None:
+            laws.append(element)
+        else:
+            linear = linear + Rational(*rational).trimmed()
+    return laws, linear
 
 
 def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equations:
