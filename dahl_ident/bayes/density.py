@@ -9,7 +9,7 @@ with the prior 1/s of the scale, flat in ln s. Integrated over s, it is
 
     ln p(theta) + ln Gamma(n) - n ln(pi S(theta)) - ln 2 + constants.
 
-If rows share errors, :mod:`dahl_ident.bayes.row_errors` replaces S. For data with outliers, rows
+If rows share errors, :mod:`dahl_ident.bayes.row_errors` replaces it. For data with outliers, rows
 may have Student's t distribution in two dimensions with nu = 4 instead, with the density
 (1 + |y|^2/(nu s^2))^-(nu/2 + 1) / (2 pi s^2).
 
@@ -70,6 +70,13 @@ _COLUMNS = (  # of a table, on which its likelihood depends
 )
 
 
+def added(residuals: FloatArray) -> FloatArray:
+    """Return sums of squares, (S, K) -> (S,); infinite for NaN residuals."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        sums = np.sum(residuals**2, axis=1)
+    return np.where(np.isnan(sums), np.inf, sums)
+
+
 class LogDensity(ABC):
     """A log-posterior over search coordinates; call it with points of shape (S, D)."""
 
@@ -87,22 +94,9 @@ class LogDensity(ABC):
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Return the residuals whose squares are added, (S, P) -> (S, K)."""
 
-    @property
-    def weights(self) -> FloatArray:
-        """Weights of their squares, (K, M) or (1, 1), for each of M sizes of shared errors."""
-        return np.ones((1, 1))
-
     def sums(self, theta: FloatArray) -> FloatArray:
-        """Return sums of squares at theta, (S, P): (S, M)."""
-        return self.added(self.residuals(theta))
-
-    def added(self, residuals: FloatArray) -> FloatArray:
-        """Return sums of squares of residuals, (S, K): (S, M); infinite for NaN residuals."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            squares = residuals**2
-            single = self.weights.shape == (1, 1)
-            sums = squares.sum(axis=1, keepdims=True) if single else squares @ self.weights
-        return np.where(np.isnan(sums), np.inf, sums)
+        """Return sums of squares of residuals at theta, (S, P): (S,)."""
+        return added(self.residuals(theta))
 
     @abstractmethod
     def marginal(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
@@ -165,7 +159,8 @@ class LogDensity(ABC):
 class Density(LogDensity):
     """Log-posterior of the parameters of a table.
 
-    Without `errors`, rows are independent; with them, the likelihood is Gaussian.
+    Without `errors`, rows are independent; with them, the likelihood is Gaussian, and an unknown
+    scale of the noise is that of the estimate.
     """
 
     problem: TableProblem
@@ -198,7 +193,9 @@ class Density(LogDensity):
         """Data, noise, sensors and shared errors."""
         problem, errors = self.problem, self.errors
         fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
-        parts = [errors.turn, errors.shared, errors.factors, errors.sizes] if errors else "none"
+        parts: Any = "none"
+        if errors:
+            parts = [errors.centre, errors.moves, errors.shared, errors.factors, errors.sizes]
         return {
             "data": [getattr(problem.data, name) for name in _COLUMNS],
             "noise": problem.noise,
@@ -214,7 +211,8 @@ class Density(LogDensity):
     @property
     def has_scale(self) -> bool:
         """Whether ln s is the last coordinate."""
-        return not self.problem.scale_known and self.likelihood != "none"
+        known = self.problem.scale_known or self.errors is not None
+        return not known and self.likelihood != "none"
 
     @property
     def decorrelation(self) -> Decorrelation:
@@ -223,8 +221,8 @@ class Density(LogDensity):
 
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return theta, (S, P), and s, (S,), which is 1 where it is known."""
-        P = len(self.problem.names)
-        return x[:, :P], np.exp(x[:, P]) if self.has_scale else np.ones(len(x))
+        P, known = len(self.problem.names), self.errors.scale if self.errors else 1.0
+        return x[:, :P], np.exp(x[:, P]) if self.has_scale else np.full(len(x), known)
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
@@ -254,10 +252,16 @@ class Density(LogDensity):
         inside = result > -np.inf
         if self.likelihood != "none" and inside.any():
             squares = (sums or self.sums)(theta[inside])
-            result[inside] += self._mean(self._exponents(squares)) + self._constant
-            if self.has_scale:
+            result[inside] += self._constant
+            if self.errors is not None:
+                result[inside] += self._combined(theta[inside], squares)
+            elif self.has_scale:
                 n = 0.5 * self.problem.n_residuals
+                with np.errstate(divide="ignore"):
+                    result[inside] -= n * np.log(squares)
                 result[inside] += float(gammaln(n) + (n - 1.0) * np.log(2.0))
+            else:
+                result[inside] -= 0.5 * squares
         return result
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
@@ -272,8 +276,7 @@ class Density(LogDensity):
         """Return ln of the data's density at theta, (S, P), and s, (S,)."""
         m = self.problem.n_residuals
         if self.errors is not None:
-            terms = -0.5 * self.sums(theta) / scale[:, None] ** 2
-            return np.asarray(self._mean(terms) + self._constant - m * np.log(scale))
+            return self._combined(theta, self.sums(theta)) + self._constant
         if self.likelihood != "student_t":
             return self.quick.log_likelihood(theta, scale if self.has_scale else None)
         z = self.quick.squares(theta) / (TAIL_DOF * scale[:, None] ** 2)
@@ -285,48 +288,16 @@ class Density(LogDensity):
         """Return the residuals whose squares are added, (S, P) -> (S, K)."""
         if self.errors is None:
             return self.quick.whitened(theta)
-        y = self.quick.whitened(self.errors.at_centre(theta), tails=False)
-        parts = np.broadcast_to(y, (len(theta), y.shape[-1]))
         with np.errstate(invalid="ignore", over="ignore"):
-            return self.errors.uncorrelated(parts + self.errors.change(theta))
+            return self.errors.weighted(
+                self.quick.whitened(self.errors.adjusted(theta), tails=False)
+            )
 
-    @property
-    def weights(self) -> FloatArray:
-        """Weights of their squares, (K, M) or (1, 1), for each of M sizes of shared errors."""
-        return np.ones((1, 1)) if self.errors is None else self.errors.weights
-
-    def probabilities(self, sums: FloatArray) -> FloatArray:
-        """Return the probability of each size of shared errors, (S, M), given sums of squares."""
-        if self.errors is None:
-            return np.ones(sums.shape)
-        each = self._exponents(sums) + self.errors.log_weights
-        return np.asarray(np.exp(each - logsumexp(each, axis=1, keepdims=True)))
-
-    def curvature(self, theta: FloatArray) -> tuple[float, FloatArray]:
-        """Return half the sum of squares at theta, (P,), and its Hessian, at estimated sizes."""
-        errors = self.errors
-        assert errors is not None
-        at = theta[None]
-        rows = self.problem.data_rows(errors.at_centre(at), tails=False)  # priors of any kind apart
-        y = rows[..., 0, :] + errors.change(at)
-        by = np.where(np.isnan(errors.centre), rows[..., 1:, :].swapaxes(-1, -2), errors.slopes)
-        with np.errstate(invalid="ignore", over="ignore"):
-            y = errors.independent(y)
-            by = errors.independent(by.swapaxes(-1, -2))[0]
-            return float(0.5 * np.sum(y**2)), by @ by.T
-
-    def _exponents(self, squares: FloatArray) -> FloatArray:
-        """Return ln of the likelihood up to a constant, an unknown scale integrated out."""
-        if not self.has_scale:
-            return -0.5 * squares
-        with np.errstate(divide="ignore"):
-            return np.asarray(-0.5 * self.problem.n_residuals * np.log(squares))
-
-    def _mean(self, terms: FloatArray) -> FloatArray:
-        """Return ln of the mean likelihood over the sizes of shared errors, (S, M) -> (S,)."""
-        if self.errors is None:
-            return np.asarray(terms[:, 0])
-        return np.asarray(logsumexp(terms + self.errors.log_weights, axis=1))
+    def _combined(self, theta: FloatArray, sums: FloatArray) -> FloatArray:
+        """Return ln of the mean likelihood over the sizes of errors, from sums of squares."""
+        assert self.errors is not None
+        terms = -0.5 * self.errors.squares(theta, sums) + self.errors.log_weights
+        return np.asarray(logsumexp(terms, axis=1))
 
     @cached_property
     def quick(self) -> TableProblem:
@@ -430,7 +401,7 @@ class RecordDensity(LogDensity):
         noise = self._least / self.problem.n_residuals
         inside = result > -np.inf
         if inside.any():
-            squares = (sums or self.sums)(theta[inside])[:, 0]
+            squares = (sums or self.sums)(theta[inside])
             excess = (squares - self._least) / (self.dof * noise)
             power = 0.5 * (self.dof + len(self.names))
             result[inside] -= power * np.log1p(np.maximum(excess, -0.5))

@@ -34,7 +34,7 @@ from numpy.polynomial.hermite_e import hermevander
 from scipy.special import gammaln, logsumexp, ndtr, stdtrit
 
 from dahl_ident.arrays import FloatArray, IntArray, cholesky_root
-from dahl_ident.bayes.density import LogDensity
+from dahl_ident.bayes.density import LogDensity, added
 from dahl_ident.bayes.moves import STRAIGHT, Decorrelation
 from dahl_ident.bayes.priors import JointPrior
 
@@ -321,16 +321,13 @@ class Interpolation:
     centre: FloatArray  # (P,) and (P, P): theta = centre + root u
     root: FloatArray
     degree: int  # of the residuals' polynomials
-    factors: FloatArray  # (M, T, T): from the T terms to M sets of numbers whose squares are summed
+    factor: FloatArray  # (T, T): from the T terms to numbers whose squares are summed
     error: float  # largest error of a probability
 
     def __call__(self, theta: FloatArray) -> FloatArray:
-        """Return sums of squares at theta, (S, P): (S, M)."""
+        """Return sums of squares at theta, (S, P): (S,)."""
         u = np.asarray(np.linalg.solve(self.root, (theta - self.centre).T).T)
-        terms = _terms(u, self.degree)
-        return np.stack(
-            [np.sum((terms @ factor.T) ** 2, axis=1) for factor in self.factors], axis=1
-        )
+        return np.asarray(np.sum((_terms(u, self.degree) @ self.factor.T) ** 2, axis=1))
 
 
 def interpolated(
@@ -367,20 +364,17 @@ def interpolated(
         far = far[density.log_prior(far) > -np.inf]
         if not (len(near) and len(far)):
             return None
-        exact = in_blocks(lambda x: density.added(residuals_of(x)), far)
+        exact = in_blocks(lambda x: added(residuals_of(x)), far)
         seen.append([near, in_blocks(residuals_of, near), far, exact])
         theta, rows, far, exact = map(np.concatenate, zip(*seen, strict=True))
-        log_p = density.marginal(theta, _constant(density.added(rows)))
+        log_p = density.marginal(theta, _constant(added(rows)))
         log_p -= log_drawn(theta, _TAILS[0])
         chosen = np.isfinite(rows).all(axis=1) & (log_p > -np.inf)
         roots = np.exp(0.5 * (log_p[chosen, None] - log_p.max()))
         terms = _terms(np.linalg.solve(root, (theta[chosen] - centre).T).T, degree)
         coefficients = np.linalg.lstsq(roots * terms, roots * rows[chosen], rcond=None)[0]
-        factors = [
-            np.linalg.qr((coefficients * np.sqrt(weights)).T, mode="r")
-            for weights in density.weights.T
-        ]
-        result = Interpolation(centre, root, degree, np.array(factors), 0.0)
+        factor = np.asarray(np.linalg.qr(coefficients.T, mode="r"))
+        result = Interpolation(centre, root, degree, factor, 0.0)
         drawn = log_drawn(far, _TAILS[1])
         if wide:
             drawn = np.logaddexp(drawn, density.prior.log_density(far))

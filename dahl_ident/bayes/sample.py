@@ -221,25 +221,29 @@ def sample_points(
             tell(evaluations)
         return result
 
-    near = None
-    log_density = partial(counted, density.marginal)
-    sums = density.sums
-    error = 0.0
+    def integral(log_density: Function, error: float) -> WeightedPoints:
+        points = integrate(
+            log_density,
+            density.prior,
+            centre,
+            covariance,
+            density.decorrelation,
+            tolerance=tolerance - error,
+        )
+        return replace(points, error=points.error + error, evaluations=evaluations)
+
     if density.likelihood == "gaussian":
         residuals_of = partial(counted, density.residuals)
         near = interpolated(density, residuals_of, centre, covariance, 0.5 * tolerance)
-    if near is not None:
-        log_density, sums, error = partial(density.marginal, sums=near), near, near.error
-    integral = integrate(
-        log_density,
-        density.prior,
-        centre,
-        covariance,
-        density.decorrelation,
-        tolerance=tolerance - error,
-    )
-    integral = replace(integral, error=integral.error + error, evaluations=evaluations)
-    return PointSample(density, integral, tolerance, sums)
+        if near is not None:
+            log_density = partial(density.marginal, sums=near)
+            points = integral(log_density, near.error)
+            some = points.drawn(_CHECKED, 0)  # polynomials may have modes of their own
+            excess = counted(density.marginal, some) - log_density(some)
+            if float(np.abs(np.expm1(excess)).mean()) <= tolerance:
+                return PointSample(density, points, tolerance, near)
+    points = integral(partial(counted, density.marginal), 0.0)
+    return PointSample(density, points, tolerance, density.sums)
 
 
 def _with_scale(density: Density, sums_of: Function, points: WeightedPoints) -> FloatArray:
@@ -252,14 +256,11 @@ def _with_scale(density: Density, sums_of: Function, points: WeightedPoints) -> 
     """
     from scipy.stats import qmc
 
-    sums = in_blocks(sums_of, points.theta)
-    uniform = qmc.Halton(2, scramble=False).random(len(sums) + 1)[1:]  # the first is zero
-    uniform = uniform[np.argsort(np.argsort(np.log(sums).mean(axis=1)))]
-    cumulative = np.cumsum(density.probabilities(sums), axis=1)
-    size = np.sum(uniform[:, 1:] * cumulative[:, -1:] > cumulative, axis=1, keepdims=True)
-    squares = np.take_along_axis(sums, size, axis=1)[:, 0]
+    squares = in_blocks(sums_of, points.theta)
+    uniform = qmc.Halton(1, scramble=False).random(len(squares) + 1)[1:, 0]  # the first is zero
+    uniform = uniform[np.argsort(np.argsort(squares))]
     rows = density.problem.n_residuals // 2
-    ln_s = 0.5 * np.log(0.5 * squares / gammainccinv(rows, uniform[:, 0]))
+    ln_s = 0.5 * np.log(0.5 * squares / gammainccinv(rows, uniform))
     return np.column_stack([points.theta, ln_s])
 
 
@@ -271,6 +272,7 @@ _POSITIONS = 5  # values tried for a parameter outside its prior, each with a fi
 # standard uncertainties from an estimate to its prior beyond which the prior excludes it: chance
 # takes a normal estimate that far off once in two million times
 _EXCLUDED = 5.0
+_CHECKED = 256  # points at which an interpolated density is compared with the exact one
 _EXACT_DATA = 1e-13  # relative noise below which residuals are rounding
 
 
@@ -328,12 +330,11 @@ def centre_and_covariance(
     theta = _inside(density, optimum, random)
     precision = np.diag([(2.0 / part.width) ** 2 for part in density.prior.priors])
     if density.likelihood != "none":
-        scale = _scale(density, theta)
         if density.errors is None:
-            information = _with_normal_priors(density.problem).information(theta, scale)
+            scale = _scale(density, theta)
+            precision += _with_normal_priors(density.problem).information(theta, scale)
         else:
-            information = density.curvature(theta)[1] / scale**2
-        precision = precision + information
+            precision += density.errors.information
     size = 1.0 / np.sqrt(np.diagonal(precision))
     return theta, np.linalg.inv(precision * np.outer(size, size)) * np.outer(size, size)
 
@@ -422,10 +423,7 @@ def _scale(density: Density, theta: FloatArray) -> float:
     """Return the likeliest noise scale at theta; 1 where it is known."""
     if not density.has_scale:
         return 1.0
-    if density.errors is None:
-        squares = float(density.quick.squares(theta[None]).sum())
-    else:
-        squares = 2.0 * density.curvature(theta)[0]
+    squares = float(density.quick.squares(theta[None]).sum())
     scale = float(np.sqrt(squares / density.problem.n_residuals))
     if not scale > _EXACT_DATA:
         raise SamplingError(

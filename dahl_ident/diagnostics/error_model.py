@@ -83,6 +83,7 @@ _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its 
 _UPPER = 0.5 * (1.0 + CONFIDENCE)
 _KINDS = 2  # of model error that were looked for, of which the more likely one counts
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
+_DETERMINED = 1e-10  # least singular value of derivatives, of the largest, that is not rounding
 _AS_STATED = 1e-6  # relative rise of the noise's variance up to which it is as stated
 
 
@@ -484,53 +485,42 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
         return None
     names = [NOISE, *(s.name for s in errors.sources), *[TESTS] * (by_tests is not None)]
     counted = tuple(dict.fromkeys(names))
-    # residuals in units of the noise of each single row, or of an unknown scale
-    unit, size = (1.0, 1.0) if problem.scale_known else (errors.noises[0], estimate.scale)
-    root = np.sqrt(unit * errors.state.weights[errors.state.model.group[:m]])
-    jacobian = size * estimate.columns
-    jacobian[:m] *= root[:, None]
-    columns = [
-        v**0.5 * root[:, None] * s.columns[:m]
-        for v, s in zip(errors.variances.tolist(), errors.sources, strict=True)
-    ]
-    basis = None  # of the directions in which rows share errors, where these are few
-    stacked = np.hstack([jacobian[:m], *columns])
-    if m > 2 * stacked.shape[1]:
-        basis, _ = np.linalg.qr(stacked)
-        columns = [basis.T @ one for one in columns]
-    r = m if basis is None else basis.shape[1]
-    noise, shared = np.eye(r), np.zeros((r, r))
-    for source, part in zip(errors.sources, columns, strict=True):
+    U, sizes, _ = np.linalg.svd(estimate.columns[:m], full_matrices=False)
+    basis = U[:, sizes > _DETERMINED * sizes[0]]
+    noise = basis.T @ (basis / errors.state.weights[errors.state.model.group[:m], None])
+    shared = np.zeros_like(noise)
+    for variance, source in zip(errors.variances.tolist(), errors.sources, strict=True):
+        part = basis.T @ source.columns[:m]
         target = noise if source.name == NOISE else shared
-        target += part @ part.T / unit
-    if by_tests is not None:  # widens the posterior by this covariance, and moves nothing
-        moved = root[:, None] * estimate.jacobian[:m]
-        moved = moved if basis is None else basis.T @ moved
-        shared += moved @ by_tests @ moved.T / unit
+        target += variance * part @ part.T
+    z, y, moved = basis.T @ estimate.y[:m], estimate.y[:m], basis.T @ estimate.jacobian[:m]
+    if by_tests is not None:
+        shared += moved @ by_tests @ moved.T
     L = np.linalg.cholesky(noise)
-    # shared over noise is diagonal in the coordinates W y; see RowErrors
+    # shared over noise is diagonal in the coordinates W z; see RowErrors
     ratios, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, shared).T))
-    W = (np.linalg.solve(L, np.eye(r)).T @ vectors).T
-    W = W if basis is None else W @ basis.T
-    volume = -float(np.log(np.diagonal(L)).sum())
-    of_runs = {s.per_test for s in errors.sources if s.name == RUNS}
-    scatters = np.array([name in of_runs for name in errors.names])
-    factors = size * root.reshape(-1, 2, 1) * estimate.factors(problem)
-    volume += float(np.log(np.abs(np.linalg.det(factors))).sum())
-    _, slopes = problem.residuals_and_jacobian(errors.theta, tails=False)
+    W = vectors.T @ np.linalg.inv(L)
+    values, axes = np.linalg.eigh(noise + shared)
+    root = axes / np.sqrt(values) @ axes.T  # of the inverse
+    factors = estimate.factors(problem)
+    volume = float(np.log(np.abs(np.linalg.det(factors))).sum() - np.log(np.diagonal(L)).sum())
     return RowErrors(
         counted,
-        W,
-        np.maximum(ratios, 0.0),
-        volume,
         factors,
+        estimate.scale,
+        errors.theta,
+        float(y @ y),
+        np.eye(len(errors.theta)) + np.linalg.pinv(moved) @ (root - np.eye(len(root))) @ moved,
+        W @ moved,
+        np.maximum(ratios, 0.0),
+        W @ z,
+        np.linalg.solve(W.T, root @ z),
+        float(y @ y - z @ z),
+        volume,
+        np.vstack([W @ moved @ estimate.basis.matrix, estimate.columns[m:]]),
+        np.append(W @ z, estimate.y[m:]),
         *_dof_and_share(errors),
-        jacobian,
-        size * np.append(root * estimate.y[:m], estimate.y[m:]),
-        problem.scale_known,
-        np.where(scatters, errors.theta, np.nan),
-        np.where(scatters, slopes[:m], 0.0),
-        basis,
+        np.inf if problem.scale_known else float(m - len(problem.names)),
     )
 
 
