@@ -13,6 +13,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number
 from dahl_ident.data.storage import place_of, plain_data, write_whole
+from dahl_ident.diagnostics.formatting import table
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
 from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_range
@@ -303,8 +304,6 @@ class Plan:
         end = "; meets the target" if self.reached else "; does NOT meet the target"
         if all(self.expected[name].before <= most for name, most in self.target.items()):
             end += ", which the data at hand meet already"
-        lines = [f"{head} in {self.seconds:.4g} s{end if self.target else ''}.", ""]
-        lines += self._levels() if sines else self._motions()
         rows = [
             (
                 name,
@@ -318,9 +317,11 @@ class Plan:
         expanded = any(map(is_expanded, self.expected))
         return "\n".join(
             [
-                *lines,
+                f"{head} in {self.seconds:.4g} s{end if self.target else ''}.",
                 "",
-                *_aligned([("", "value", "before", "after", "wanted"), *rows], 24, [11] * 4),
+                self._table(),
+                "",
+                table([("", "value", "before", "after", "wanted"), *rows]),
                 "Relative standard uncertainties" + "; U(...) expanded, 95.45 %" * expanded + ".",
                 *(f"{text}." for text in self.undetermined),
                 *self._spare(),
@@ -343,50 +344,27 @@ class Plan:
             )
         return lines
 
-    def _levels(self) -> list[str]:
-        heading = ("", f"level [{self._unit}]", "[Hz]", "settling", "measured", "time [s]")
-        rows = [
-            (
-                str(i),
-                f"{s.level:.4g}",
-                f"{s.frequency_hz:.4g}",
-                str(s.settling_cycles),
-                str(s.measured_cycles),
-                f"{s.seconds:.1f}",
-            )
-            for i, s in enumerate(self.steps, start=1)
+    def _table(self) -> str:
+        """Return the steps as text, one line each."""
+        rows = [_row(step) for step in self.steps]
+        last = ("period", "repeats", "seconds")
+        names = sorted(dict.fromkeys(n for row in rows for n in row), key=last.__contains__)
+        units = {**trajectories.UNITS, "level": "N" if self.controlled == "force" else "m"}
+        headings = [
+            f"{n.removesuffix('_hz').replace('_', ' ')} [{shown_unit(units[n], self.motion)}]"
+            if n in units
+            else n.replace("_", " ")
+            for n in names
         ]
-        return _aligned([heading, *rows], 4, [13, 10, 10, 10, 10])
-
-    def _motions(self) -> list[str]:
-        moving = [(s, s.motion) for s in self.steps if s.motion is not None]
-        names = {
-            n: f"{n} [{shown_unit(trajectories.UNITS[n], self.motion)}]"
-            for _, motion in moving
-            for n in motion.parameters
-        }
-        rows = [
-            (
-                str(i),
-                motion.kind,
-                *(f"{motion.parameters[n]:.4g}" if n in motion.parameters else "-" for n in names),
-                f"{1.0 / s.frequency_hz:.4g}",
-                str(s.measured_cycles),
-                f"{s.seconds:.1f}",
-            )
-            for i, (s, motion) in enumerate(moving, start=1)
+        lines = [
+            [str(i), *(_cell(row.get(n, "-")) for n in names)]
+            for i, row in enumerate(rows, start=1)
         ]
-        table = [("", "motion", *names.values(), "one [s]", "repeats", "time [s]"), *rows]
-        first, *widths = (max(map(len, column)) for column in list(zip(*table, strict=True))[1:])
-        return _aligned(table, 4, [first, *(w + 2 for w in widths)])
+        return table([["", *headings], *lines])
 
 
-def _aligned(rows: Sequence[Sequence[str]], first: int, widths: Sequence[int]) -> list[str]:
-    """Return rows of text, with the first column left-aligned."""
-    return [
-        f"{row[0]:{first}}" + "".join(f"{t:>{w}}" for t, w in zip(row[1:], widths, strict=True))
-        for row in rows
-    ]
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _row(step: PlanStep) -> dict[str, Any]:

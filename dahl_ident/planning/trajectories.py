@@ -23,6 +23,9 @@ UNITS = {
     "highest_hz": "Hz",
     "peak": "m",
     "rms": "m",
+    "period": "s",
+    "frequency_hz": "Hz",
+    "seconds": "s",
 }
 _FINE = 64  # points for each spectral line: a multisine's peak then errs by less than 0.1 %
 
