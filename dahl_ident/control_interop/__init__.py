@@ -28,9 +28,9 @@ if TYPE_CHECKING:
         level_responses,
         response_branches,
     )
-    from dahl_ident.control_interop.linear_part import closed_loop_response
     from dahl_ident.control_interop.linearization import (
         LoopMargins,
+        closed_loop_response,
         equivalent_plant,
         loop_margins,
     )
@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 _FILES = {
     "levels": "Branches LevelResponses level_responses response_branches",
     "cycles": "LimitCycle LimitCycles limit_cycles",
-    "linear_part": "closed_loop_response",
-    "linearization": "LoopMargins equivalent_plant loop_margins",
+    "linearization": "LoopMargins closed_loop_response equivalent_plant loop_margins",
     "nonlinearity": "FrictionNonlinearity",
     "steady_response": "SteadyResponse response",
 }

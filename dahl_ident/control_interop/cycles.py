@@ -7,8 +7,15 @@ fundamental of a free oscillation x = A cos(omega t) is balanced if
 
 Both curves, -L over frequency and N over amplitude, are computed in logarithmic polar coordinates,
 where they are smooth; their crossings are the starts of Newton's method in (ln A, ln omega). From
-each crossing the exact periodic motion is found by shooting
-(:mod:`dahl_ident.control_interop.free_motion`).
+each crossing the exact periodic motion is found by shooting. It returns to its state after a
+period that is unknown as well:
+
+    y(T; y_0) = y_0,    v(0) = 0.
+
+These equations are solved for y_0 and T with the derivatives of the motion. If the system is the
+same in both directions, half a period leads to -y_0. Of Floquet's multipliers, the eigenvalues of
+the derivative of this map, one is 1 (the motion may be shifted in time); the largest of the others
+gives the growth of a disturbance.
 
 A disturbance dA of the amplitude shifts the root by ds = -N'(A) dA/L'(s), so dA grows
 at the rate -A Re(N'/L'(s)), which is negative for a stable cycle (Loeb's criterion).
@@ -21,19 +28,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.optimize import root
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
-from dahl_ident.control_interop.free_motion import free_motion
-from dahl_ident.control_interop.linear_part import (
+from dahl_ident.control_interop.linearization import (
     has_polynomials,
     known_range,
     rational_stiffness,
 )
 from dahl_ident.control_interop.nonlinearity import friction_alone, friction_and_slope
-from dahl_ident.elements.driven_motion import Steady, obstacle
+from dahl_ident.elements.driven_motion import NEUTRAL, Steady, obstacle
 from dahl_ident.elements.element import Element, Model, as_model
+from dahl_ident.elements.equations import law_equations, plant_equations
 from dahl_ident.elements.linear_system import LinearSystem, check_system
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.engine import System, march, settled, translate
+from dahl_ident.errors import FitError, ModelError, ValidationError
 
 _AMPLITUDES_PER_DECADE = 60  # 4 % apart; N is smooth, and crossings are interpolated
 _FREQUENCIES_PER_DECADE = 400  # 0.6 % apart; sharper resonances get additional ones
@@ -42,8 +51,14 @@ _BEYOND_ROOTS = 1e3  # beyond all poles and zeros L is a power of the frequency
 _AROUND_RESONANCE = np.geomspace(0.01, 300.0, 60)  # times |Re| of a pole, its half width
 _PAIRS_AT_ONCE = 2**20  # of segments: 16 MB for each complex array
 _FREQUENCY_STEP = 1e-5  # relative, of the frequency: truncation 1e-10, rounding 2e-11
-_NEWTON_STEPS = 40  # of at most 0.5 in a logarithm: almost nine decades
 _RESIDUAL = 1e-6  # of ln(-L/N); where Newton's method converges, it is far smaller
+_STARTS = (1.0, 0.7, 1.4, 0.5, 0.35, 0.25)  # starts over the estimate, tried until one converges
+_EVALUATIONS = 60  # at most from each start; usually ten are needed
+_CLOSED_CYCLE = 1e-7  # largest difference of first and last state, relative to the states' sizes
+_DIVERGED = 1e3  # the same for a motion that grows without bound
+_ANOTHER_MOTION = np.log(5.0)  # largest log ratio of amplitude or period to the estimate
+_SAMPLES = 256  # per period, for the harmonics
+_HIGHEST = 9  # harmonic
 
 
 @dataclass(frozen=True)
@@ -188,14 +203,8 @@ def limit_cycles(
     plant = Model(*linear.elements, *friction.elements)
     approximate = obstacle(plant) if steady == "exact" else "as asked for"
     if not approximate:
-        motions = [free_motion(plant, c.amplitude, c.omega) for c in crossings]
-        cycles = LimitCycles(
-            _distinct(
-                LimitCycle(m.amplitude, m.omega / (2.0 * np.pi), m.growth_rate, m.share)
-                for m in motions
-                if m is not None
-            )
-        )
+        motions = [_free_motion(plant, crossing) for crossing in crossings]
+        cycles = LimitCycles(_distinct(motion for motion in motions if motion is not None))
         if crossings and not cycles:
             crossing = crossings[0]
             cycles.reason = (
@@ -313,23 +322,21 @@ def _crossings(first: ComplexArray, second: ComplexArray) -> list[tuple[int, int
 def _refine(linear: Model, friction: Model, amplitude: float, omega: float) -> LimitCycle | None:
     """Return the limit cycle near a crossing, by Newton's method; None if there is none."""
     low, high = known_range(linear)
-    point = np.log([amplitude, omega])
-    for _ in range(_NEWTON_STEPS):
+
+    def balance(point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return ln(-L/N) and its slopes, real over imaginary parts."""
         A, w = np.exp(point[:1]), np.clip(np.exp(point[1:]), low, high)
-        N, slope = (v[0] for v in friction_and_slope(friction, A))
-        L, L_slope = stiffness_of(linear, w)[0], stiffness_slope(linear, w)[0]
-        residual = np.log(-L / N)
-        columns = np.array([-slope / N, w[0] * L_slope / L])
-        jacobian = np.array([columns.real, columns.imag])
-        if not np.isfinite(jacobian).all() or np.linalg.matrix_rank(jacobian) < 2:
-            return None
-        step = np.linalg.solve(jacobian, [-residual.real, -residual.imag])
-        if np.max(np.abs(step)) < 1e-10:
-            break
-        point = point + step * min(1.0, 0.5 / np.max(np.abs(step)))
-    if abs(residual) > _RESIDUAL:
+        N, slope = friction_and_slope(friction, A)
+        L, L_slope = stiffness_of(linear, w), stiffness_slope(linear, w)
+        parts = np.array([np.log(-L / N), -slope / N, w * L_slope / L])[..., 0]
+        return np.array([parts[0].real, parts[0].imag]), np.array([parts[1:].real, parts[1:].imag])
+
+    solution = root(balance, np.log([amplitude, omega]), jac=True, tol=1e-12)
+    if not np.abs(solution.fun).max() < _RESIDUAL:
         return None
-    return LimitCycle(float(A[0]), float(w[0] / (2.0 * np.pi)), float((slope / L_slope).imag))
+    A, w = np.exp(solution.x[:1]), np.clip(np.exp(solution.x[1:]), low, high)
+    rate = friction_and_slope(friction, A)[1] / stiffness_slope(linear, w)
+    return LimitCycle(float(A[0]), float(w[0] / (2.0 * np.pi)), float(rate[0].imag))
 
 
 def _distinct(cycles: Iterable[LimitCycle]) -> tuple[LimitCycle, ...]:
@@ -341,3 +348,96 @@ def _distinct(cycles: Iterable[LimitCycle]) -> tuple[LimitCycle, ...]:
         if not any(np.allclose(point, other, rtol=1e-6, atol=0.0) for other in others):
             distinct.append(cycle)
     return tuple(distinct)
+
+
+def _free_motion(plant: Model, estimate: LimitCycle) -> LimitCycle | None:
+    """Return the periodic motion of a whole loop near that of the describing function, if any."""
+    loop = _Loop(plant)
+    y, period = loop.start(estimate), loop.half_periods * np.pi / estimate.omega
+    for scale in _STARTS:
+        orbit = loop.closed(y * scale, period)
+        if orbit is not None:
+            return loop.described(*orbit, near=estimate)
+    return None
+
+
+class _Loop:
+    """The compiled equations of a loop, and the map of its state over a period."""
+
+    def __init__(self, plant: Model) -> None:
+        import casadi as ca
+
+        equations = plant_equations(plant)
+        self.system: System = translate(equations)
+        self.half_periods = 1 if self.system.odd else 2  # covered by the map
+        self._sign = -1.0 if self.system.odd else 1.0
+        self._plant = plant
+        self._values = np.array([float(v) for v in plant.known_values()])
+        states, names = ca.vertcat(*equations.states), ca.vertcat(*equations.parameters)
+        arguments = [states, equations.drive, equations.direction, names]
+        self._rates = ca.Function("rates", arguments, [equations.rates])
+
+    def start(self, estimate: LimitCycle) -> FloatArray:
+        """Return the state at the peak of a steady sinusoidal motion."""
+        y = [np.array([estimate.amplitude, 0.0])]
+        for element in self._plant.elements:
+            if element.n_states:
+                values = np.array([[float(v) for v in element.known_values()]])
+                sine = np.array([estimate.amplitude]), np.array([estimate.omega])
+                y.append(settled(translate(law_equations(element)), *sine, values).starts[0, 2:])
+        return np.concatenate(y)
+
+    def closed(self, y: FloatArray, period: float) -> tuple[FloatArray, float] | None:
+        """Return state and period of the periodic motion found from a start."""
+        size = np.maximum(np.abs(y), 1e-3 * np.abs(y).max())
+        at_rest = np.arange(y.size) == 1
+
+        def state(z: FloatArray) -> FloatArray:
+            return np.asarray(np.insert(z[:-1], 1, 0.0) * size)
+
+        def mismatch(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+            """Return what the motion does not close by, relative to the sizes, and its slopes."""
+            try:
+                end, slope, rates = self.after(state(z), float(z[-1]) * period)
+            except FitError:
+                return np.full(y.size, _DIVERGED), np.zeros((y.size, y.size))
+            columns = [((slope - np.eye(y.size)) * size)[:, ~at_rest], period * rates]
+            return (end - state(z)) / size, np.column_stack(columns) / size[:, None]
+
+        start = np.append((y / size)[~at_rest], 1.0)
+        solution = root(
+            mismatch,
+            start,
+            jac=True,
+            method="lm",
+            options={"xtol": 1e-14, "ftol": 1e-14, "maxiter": _EVALUATIONS},
+        )
+        if not np.abs(solution.fun).max() < _CLOSED_CYCLE or solution.x[-1] <= 0.0:
+            return None
+        return state(solution.x), float(solution.x[-1]) * period
+
+    def after(self, y: FloatArray, period: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return state, map derivative and rates after a period; after half of one, negated."""
+        ends, undriven = np.array([0.0, period]), np.zeros((1, 1))
+        motion = march(self.system, ends, undriven, ends, y, self._values, derivatives=True)
+        end = motion.states[-1]
+        rates = self._rates(end, 0.0, np.sign(end[1]) or -self._sign, self._values).full()[:, 0]
+        return self._sign * end, self._sign * motion.map, self._sign * rates
+
+    def described(self, y: FloatArray, period: float, near: LimitCycle) -> LimitCycle | None:
+        """Return size, frequency and stability of a motion; None if it is far from `near`."""
+        full_period = period * 2 / self.half_periods
+        times = np.linspace(0.0, full_period, _SAMPLES + 1)
+        x = march(self.system, times[[0, -1]], np.zeros((1, 1)), times, y, self._values).output
+        X = 2.0 * np.fft.rfft(x[:-1])[: _HIGHEST + 1] / _SAMPLES
+        amplitude, frequency_hz = float(abs(X[1])), 1.0 / full_period
+        ratios = [max(amplitude, 1e-300) / near.amplitude, frequency_hz / near.frequency_hz]
+        if np.abs(np.log(ratios)).max() > _ANOTHER_MOTION:
+            return None
+        others = np.append(0.5 * X[0], X[2:])
+        multipliers = np.linalg.eigvals(self.after(y, period)[1])
+        multipliers = np.delete(multipliers, np.argmin(np.abs(multipliers - 1.0)))
+        largest = float(np.abs(multipliers).max())
+        growth = 0.0 if abs(largest - 1.0) < NEUTRAL else float(np.log(largest)) / period
+        share = float(np.linalg.norm(others)) / amplitude
+        return LimitCycle(amplitude, frequency_hz, growth, share)

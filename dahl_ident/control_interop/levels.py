@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.cycles import stiffness_of, stiffness_slope
-from dahl_ident.control_interop.linear_part import split
+from dahl_ident.control_interop.linearization import split
 from dahl_ident.control_interop.nonlinearity import friction_and_slope
 from dahl_ident.control_interop.steady_response import SteadyResponse, response
 from dahl_ident.data.columns import CONTROLLED, one_of
@@ -267,14 +267,9 @@ def _slow_growth(friction: Model, linear: Model, steady: SteadyResponse) -> Floa
     w = omega.ravel()
     Z = stiffness_of(linear, w).reshape(omega.shape) + N
     by_s = -1j * stiffness_slope(linear, w).reshape(omega.shape)
-    rate = _largest_rate(Z, slope, by_s)
-    return np.where(exists, rate, np.nan)
-
-
-def _largest_rate(Z: ComplexArray, slope: ComplexArray, by_s: ComplexArray) -> FloatArray:
-    """Return the largest real part of the two eigenvalues of -(Z xi + slope Re xi)/by_s."""
+    # the larger real part of the eigenvalues of -(Z xi + slope Re xi)/by_s
     radial, turning = (Z + slope) / by_s, Z / by_s
     half_trace = -0.5 * (radial + turning).real
     determinant = (radial * turning.conj()).real
     root = np.sqrt((half_trace**2 - determinant).astype(np.complex128))
-    return np.asarray(half_trace + root.real)
+    return np.where(exists, half_trace + root.real, np.nan)

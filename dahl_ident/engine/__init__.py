@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dahl_ident.engine.motion import Marched, Settled, loops, march, settled
-from dahl_ident.engine.periodic import steady_motions
+from dahl_ident.engine.motion import Marched, Settled, loops, march, settled, steady_motions
 from dahl_ident.engine.sampled import (
     band_limited,
     differentiated,
