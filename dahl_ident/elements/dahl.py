@@ -29,7 +29,6 @@ from dahl_ident.elements.facts import (
     Asymptote,
     Combination,
     HistoryGradient,
-    Orders,
     Path,
     Sine,
     StiffnessGradient,
@@ -47,8 +46,7 @@ from dahl_ident.errors import ValidationError
 _EXPONENTS = (1e-9, 1e3)  # beyond them the loop equals that of the limit
 _ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
 _JENKINS = 3  # elements of Maxwell slip compared with Dahl: six numbers, more than most tables give
-_AT_REST = 1e-30
-"""Smaller beta count as rest: the difference is below rounding."""
+_AT_REST = 1e-30  # smaller beta count as rest: the difference is below rounding
 _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
 """x_c over the largest amplitude, twice, and over the smallest: the limits, to every digit."""
 _SHARP, _SOFT = 1e-6, 1e3  # alpha
@@ -215,32 +213,30 @@ class Dahl(Friction):
         """
         if self.has_optional:
             return super().settled(values, sine, derivatives)
-        f_max, sigma, alpha = values
-        if bool(np.equal(alpha, 1.0).all()):
+        if bool(np.equal(values[2], 1.0).all()):
             return self._settled_linear(values, sine, derivatives)
-        beta = sigma * sine.amplitude / f_max
-        return _scaled(
-            values, sine, general_dahl.stiffness(beta, alpha, sine.harmonic, derivatives)
-        )
+        beta = _beta(values, sine)
+        parts = general_dahl.stiffness(beta, values[2], sine.harmonic, derivatives)
+        return _scaled(values, beta, parts)
 
     @each_harmonic
     def _settled_linear(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        f_max, sigma, alpha = values
-        beta, k = sigma * sine.amplitude / f_max, int(sine.harmonic)
+        beta, k = _beta(values, sine), int(sine.harmonic)
+        parts: tuple[ComplexArray, ...]
         if k != 1:
             c, rise = linear_dahl.harmonic_gradient(beta, k)
-            parts = tuple(_per(part, beta) for part in (c, c - rise, rise))
+            parts = (c / beta, (c - rise) / beta, rise / beta)
         elif derivatives:
             parts = linear_dahl.describing_function_gradient(beta)
         else:
             parts = (linear_dahl.describing_function(beta),)
         if derivatives > 1:
             if self.parameters[2].free:
-                by_alpha = general_dahl.stiffness(beta, alpha, k, derivatives)[3]
+                by_alpha = general_dahl.stiffness(beta, values[2], k, derivatives)[3]
             else:
                 by_alpha = np.zeros(beta.shape, dtype=np.complex128)
             parts = (*parts, by_alpha)
-        return _scaled(values, sine, parts[: general_dahl.COUNTS[derivatives]])
+        return _scaled(values, beta, parts[: general_dahl.COUNTS[derivatives]])
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
@@ -412,49 +408,25 @@ class Dahl(Friction):
         return (f"{self.parameters[3].name} leaves almost no friction in one direction",)
 
 
-def _scaled(values: Values, sine: Sine, parts: Sequence[ComplexArray]) -> StiffnessGradient:
+def _beta(values: Values, sine: Sine) -> FloatArray:
+    """Return sigma A/f_max, above 0, so that derivatives with respect to A have their limits."""
+    f_max, sigma, _ = values
+    return np.maximum(sigma * sine.amplitude / f_max, _AT_REST)
+
+
+def _scaled(values: Values, beta: FloatArray, parts: Sequence[ComplexArray]) -> StiffnessGradient:
     """Return the stiffness and its derivatives from those over sigma.
 
     The derivatives are with respect to ln f_max, ln sigma and alpha, as many as were computed; the
     first also gives the derivative with respect to the amplitude.
     """
     f_max, sigma, _ = values
-    h, *slopes = parts
     by_amplitude: ComplexArray = _NO_DERIVATIVE
     by_parameter: tuple[ComplexArray, ...] = ()
-    if slopes:
-        beta = sigma * sine.amplitude / f_max
-        by_amplitude = _by_amplitude(values, beta, sine.harmonic, slopes[0])
-    if len(slopes) > 1:
-        by_parameter = (sigma / f_max * slopes[0], slopes[1], sigma * slopes[2])
-    return StiffnessGradient(sigma * h, by_amplitude, by_parameter)
-
-
-def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:
-    """Return c/beta, with the limit 0 at beta = 0 that every harmonic k > 1 has."""
-    return np.divide(c, beta, out=np.zeros(np.shape(c), dtype=np.complex128), where=beta > _AT_REST)
-
-
-def _by_amplitude(
-    values: Values, beta: FloatArray, harmonic: Orders, by_ln_f_max: ComplexArray
-) -> ComplexArray:
-    """Return dN/dA = -(sigma/A) dh/d(ln f_max), also at rest."""
-    f_max, sigma, _ = values
-    slope = np.asarray(by_ln_f_max * (-sigma / f_max * sigma / np.maximum(beta, _AT_REST)))
-    rests = beta < _AT_REST
-    if np.any(rests):
-        slope = np.where(rests, _slope_at_rest(values, harmonic, slope.shape), slope)
-    return slope
-
-
-def _slope_at_rest(values: Values, harmonic: Orders, shape: tuple[int, ...]) -> ComplexArray:
-    """Return dN/dA at A = 0: the loss grows in proportion to A (Rayleigh), the stiffness does not.
-
-    N_k/sigma -> j 4 alpha beta / (pi k (4 - k^2)) for odd k.
-    """
-    f_max, sigma, alpha = values
-    odd = np.asarray(harmonic) % 2 == 1
-    k = np.where(odd, harmonic, 1)
-    loss = 4.0 * alpha * sigma**2 / f_max / (np.pi * k * (4 - k**2))
-    slope = np.where(odd, 1j * loss, 0.0)
-    return np.broadcast_to(slope, shape).astype(np.complex128)
+    if len(parts) > 1:
+        by_amplitude = np.asarray(parts[1] * (-sigma / f_max * sigma / beta))
+    if np.any(beta <= _AT_REST):
+        parts = [np.where(beta > _AT_REST, part, part.round()) for part in parts]  # 0 or 1
+    if len(parts) > 2:
+        by_parameter = (sigma / f_max * parts[1], parts[2], sigma * parts[3])
+    return StiffnessGradient(sigma * parts[0], by_amplitude, by_parameter)
