@@ -169,14 +169,14 @@ def _refuse_unknown(what: str, names: Collection[str], known: Collection[str]) -
 
 def _run_laws(folder: Path, laws: Any) -> None:
     """Run the files of laws, so that their laws are known by their kinds."""
+    from dahl_ident.elements.law_files import load_laws
+
     files = [laws] if isinstance(laws, str) else laws
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         raise ValidationError(
             f"laws is {laws!r}; expected the path of a Python file, or a list of paths"
         )
     for file in files:
-        from dahl_ident.elements.law_files import load_laws
-
         load_laws(folder / file)
 
 

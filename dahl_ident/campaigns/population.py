@@ -468,8 +468,7 @@ def _reml(data: _Fits) -> tuple[float, float]:
     spread = float(np.sqrt(np.var(data.y) + data.u2.min()))
 
     def objective(x: FloatArray) -> float:
-        tau, omega = np.abs(x) * spread  # even in both, so that zero is an ordinary point
-        return -data.solve(tau, omega).log_likelihood
+        return -data.solve(*np.abs(x) * spread).log_likelihood  # even, so that zero is ordinary
 
     if len(data.y) == data.devices:
         best = optimize.minimize_scalar(

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -253,7 +252,7 @@ def campaign(
     workers = None if jobs is None else whole_number(jobs, "jobs", 1)
     folder, laws = definition.folder, _laws(definition)
     if dry_run:
-        tasks = _by_key(definition, Limits(timeout, memory))
+        tasks = _by_key(definition)
         agree = _options_agree(definition, redo)
         return _split(definition, tasks, finished(folder / _JOURNAL)[0] if agree else ())
     make_folder(folder)
@@ -262,7 +261,7 @@ def campaign(
         agree = _options_agree(definition, redo)
         with closing(Journal(folder / _JOURNAL)) as journal:
             limits = Limits(timeout, memory, journal.seconds)
-            tasks = _by_key(definition, limits)
+            tasks = _by_key(definition)
             outcome = _split(definition, tasks, journal.places)
             missing = [key for key in tasks if key not in journal.places]
             work = ((key, _job(definition, tasks[key], send_files, laws)) for key in missing)
@@ -394,11 +393,11 @@ def _options_agree(definition: Definition, redo: bool) -> bool:
     return not changed
 
 
-def _by_key(definition: Definition, limits: Limits) -> dict[str, Task]:
+def _by_key(definition: Definition) -> dict[str, Task]:
     """Return the tasks by their keys.
 
     A file's digest is computed again only if its size or modification time differs from that stored
-    with the last digest. A file whose digest takes longer than a fit may take is left to its fit.
+    with the last digest.
     """
     cache_path = definition.folder / "digests.json"
     try:
@@ -414,7 +413,7 @@ def _by_key(definition: Definition, limits: Limits) -> dict[str, Task]:
                 state = path.stat()
                 entry = cache.get(str(path))
                 if entry is None or entry[:2] != [state.st_size, state.st_mtime_ns]:
-                    entry = [state.st_size, state.st_mtime_ns, _digest(path, limits.seconds)]
+                    entry = [state.st_size, state.st_mtime_ns, digest_of(path)]
                 digests[str(path)] = entry
             except (OSError, DataError):
                 entry = [0, 0, "unreadable"]  # a row that says so, until it can be read
@@ -423,23 +422,6 @@ def _by_key(definition: Definition, limits: Limits) -> dict[str, Task]:
     if definition.folder.is_dir() and digests != cache:
         write_whole(cache_path, json.dumps(digests).encode(), overwrite=True)
     return tasks
-
-
-def _digest(path: Path, seconds: float) -> str:
-    """Return the digest of a file whose medium may hang."""
-    digest: Future[str] = Future()
-
-    def read() -> None:
-        try:
-            digest.set_result(digest_of(path))
-        except DataError as exc:
-            digest.set_exception(exc)
-
-    threading.Thread(target=read, daemon=True).start()
-    try:
-        return digest.result(seconds)
-    except TimeoutError:
-        raise DataError(f"{path}: cannot be read within {seconds:.3g} s") from None
 
 
 class Journal:

@@ -75,8 +75,13 @@ def do(job: Job) -> Row:
     start = time.perf_counter()
     digests: list[str] = []
     try:
+        from dahl_ident.elements.element import laws_of
+
         for law in job.laws:
-            _load(law)
+            if isinstance(law, str):
+                importlib.import_module(law)
+            else:
+                laws_of(law)
         row = _fitted(job, digests)
     except UnseenError as exc:
         row = failed(
@@ -94,16 +99,6 @@ def do(job: Job) -> Row:
         refused = isinstance(exc, (ValidationError, ModelError))
         row = failed(f"{type(exc).__name__}: {' '.join(str(exc).split())}", refused=refused)
     return {**row, "digests": digests, "seconds": time.perf_counter() - start}
-
-
-def _load(law: str | LawFile) -> None:
-    """Import a module, or run a file, so that the laws in it are known by their kinds."""
-    if isinstance(law, str):
-        importlib.import_module(law)
-        return
-    from dahl_ident.elements.element import laws_of
-
-    laws_of(law)
 
 
 def _fitted(job: Job, digests: list[str]) -> Row:
