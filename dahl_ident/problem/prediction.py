@@ -33,7 +33,7 @@ from dahl_ident.control_interop.force_balance import solve
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.elements.driven_motion import Shooting
-from dahl_ident.elements.facts import Sine
+from dahl_ident.elements.facts import Sine, StiffnessGradient
 from dahl_ident.errors import DataError, argument
 from dahl_ident.problem.space import Space
 from dahl_ident.problem.steady_rows import SteadyRows
@@ -276,90 +276,90 @@ class Predictor:
         group: _Group,
         values: list[FloatArray],
         derivatives: int,
-        amplitude_error: FloatArray | None,
+        error: FloatArray | None,
     ) -> Prediction:
         if group.steady is None:
-            return self._predict_sine(group, values, derivatives, amplitude_error)
+            return self._response(group, values, derivatives, error)
         linear = group.steady.is_linear(values[:-3])[..., None]
         if linear.all():
-            return self._predict_sine(group, values, derivatives, amplitude_error)
+            return self._response(group, values, derivatives, error)
         if not linear.any():
-            return self._predict_steady(group, group.steady, values, derivatives, amplitude_error)
+            return self._response(group, values, derivatives, error, group.steady)
         # no motions are computed for values that are NaN
         nonlinear = [*(np.where(linear, np.nan, v) for v in values[:-3]), *values[-3:]]
-        exact = self._predict_steady(group, group.steady, nonlinear, derivatives, amplitude_error)
-        sine = self._predict_sine(group, values, derivatives, amplitude_error)
+        exact = self._response(group, nonlinear, derivatives, error, group.steady)
+        sine = self._response(group, values, derivatives, error)
         pairs = zip(sine.arrays, exact.arrays, strict=True)
         return Prediction.of([np.where(linear, a, b) for a, b in pairs])
 
-    def _predict_sine(
+    def _response(
         self,
         group: _Group,
         values: list[FloatArray],
         derivatives: int,
-        amplitude_error: FloatArray | None,
+        error: FloatArray | None,
+        steady: SteadyRows | None = None,
     ) -> Prediction:
-        """Return the response by the describing function, which has no harmonics of the motion."""
+        """Return R = (j omega)^p (g Y)^q, Y = Z of a sine, or u_0/X_k of the steady motion."""
         model_values, sensor_values = values[:-3], values[-3:]
-        amplitude, exists = self._amplitude(group, model_values, sensor_values, amplitude_error)
-        harmonic = 1 if group.forced else group.orders
-        factor = group.operator * (group.harmonic == harmonic)
+        factor, power = group.operator, self._exponent
         if not self._exact_sensors:
             sensor = measured_stiffness_factor(sensor_values, group.omega, group.harmonic)
-            factor = factor * sensor**self._exponent
+            factor = factor * sensor**power
+        free = [i for i, (index, _) in enumerate(self._slots[:-3]) if index is not None]
+        if steady is None:
+            Y, by_level, by = self._stiffness(
+                group, model_values, sensor_values, derivatives, error
+            )
+            factor = factor * (group.harmonic == 1) if group.forced else factor
+            by = tuple(by[i] for i in free) if derivatives > 1 else ()
+        else:  # X_k may be zero
+            drive, power = self._true_drive(group, sensor_values, error), -power
+            motion = steady.at(model_values, drive, free if derivatives > 1 else [])
+            Y, by_level = motion.displacement / drive, motion.by_drive
+            by_level = by_level - Y
+            by = tuple(np.moveaxis(motion.by_parameter, -1, 0) / drive)
+        response = factor * Y if power == 1 else factor / Y
         if not derivatives:
-            Z = self._model.stiffness(model_values, amplitude, group.omega, harmonic)
-            return Prediction(factor * _where(exists, Z) ** self._exponent, [], _NONE)
-        sine = Sine(amplitude, group.omega, harmonic)
-        Z, by_amplitude, by_parameter = self._model.settled(model_values, sine, derivatives)
-        Z = _where(exists, Z)
-        by_ln_amplitude = amplitude * by_amplitude
-        response = factor * Z if self._exponent == 1 else factor / Z
-        slope = factor if self._exponent == 1 else -response / Z  # dR/dZ
-        # d ln A / d ln u_0
-        by_ln_drive = 1.0 / (1.0 + (by_ln_amplitude / Z).real) if group.forced else None
-        by_theta = []
-        for (index, _), value, d in zip(self._slots, model_values, by_parameter, strict=False):
-            if index is None or derivatives < 2:
-                continue
-            change = d * value if self._space.positive[index] else d
-            if by_ln_drive is not None:
-                change = change - by_ln_amplitude * ((change / Z).real * by_ln_drive)
-            by_theta.append(slope * change)
-        by_level = slope * by_ln_amplitude * (1.0 if by_ln_drive is None else by_ln_drive)
+            return Prediction(response, [], _NONE)
+        slope = factor if power == 1 else -response / Y  # dR/dY
+        by_level, by_theta = slope * by_level, []
+        for i, change in zip(free, by, strict=False):
+            positive = self._space.positive[self._slots[i][0]]
+            by_theta.append(slope * (change * model_values[i] if positive else change))
         if not self._exact_sensors and derivatives > 1:
             by_theta += self._by_sensors(group, response, by_level)
         return Prediction(response, by_theta, by_level)
 
-    def _predict_steady(
+    def _stiffness(
         self,
         group: _Group,
-        rows: SteadyRows,
-        values: list[FloatArray],
+        model_values: list[FloatArray],
+        sensor_values: list[FloatArray],
         derivatives: int,
         error: FloatArray | None,
-    ) -> Prediction:
-        """Return the response of the exact steady motion: R = (j omega)^p (g u_0/X_k)^q."""
-        model_values, sensor_values = values[:-3], values[-3:]
-        factor, drive = group.operator, self._true_drive(group, sensor_values, error)
-        if not self._exact_sensors:
-            sensor = measured_stiffness_factor(sensor_values, group.omega, group.harmonic)
-            factor = factor * sensor**self._exponent
-        free = [i for i, (index, _) in enumerate(self._slots[:-3]) if index is not None]
-        motion = rows.at(model_values, drive, free if derivatives > 1 else [])
-        response = factor * (motion.displacement / drive) ** -self._exponent
+    ) -> StiffnessGradient:
+        """Return Z by the describing function, with derivatives by ln A or ln u_0, and values."""
+        forced, exists, drive = group.forced, np.ones((), dtype=np.bool_), None
+        amplitude = group.amplitude if self._exact_sensors else group.amplitude / sensor_values[1]
+        if forced:
+            drive = self._true_drive(group, sensor_values, error)
+            amplitude = solve(self._model, model_values, group.omega, drive, amplitude)
+            exists = np.isfinite(amplitude)
+            amplitude = np.where(exists, amplitude, 1.0)
+        elif error is not None:
+            amplitude = amplitude * np.exp(-error[..., group.rows])
+        sine = Sine(amplitude, group.omega, 1 if forced else group.orders)
+        Z, by_amplitude, by = self._model.settled(model_values, sine, derivatives)
+        Z = Z if exists.all() else np.where(exists, Z, np.nan)
         if not derivatives:
-            return Prediction(response, [], _NONE)
-        slope = factor / drive if self._exponent == -1 else -response / motion.displacement
-        by_theta = []
-        for column, i in enumerate(free if derivatives > 1 else []):
-            positive = self._space.positive[self._slots[i][0]]
-            change = motion.by_parameter[..., column]
-            by_theta.append(slope * (change * model_values[i] if positive else change))
-        by_level = slope * drive * motion.by_drive + self._exponent * response
-        if not self._exact_sensors and derivatives > 1:
-            by_theta += self._by_sensors(group, response, by_level)
-        return Prediction(response, by_theta, by_level)
+            return StiffnessGradient(Z, by_amplitude, by)
+        by_level = amplitude * by_amplitude
+        if forced:
+            by_ln_drive = 1.0 / (1.0 + (by_level / Z).real)  # d ln A / d ln u_0
+            by = tuple(d - by_level * ((d / Z).real * by_ln_drive) for d in by)
+            by_level = by_level * by_ln_drive
+        return StiffnessGradient(Z, by_level, by)
 
     def _true_drive(
         self, group: _Group, sensor_values: Sequence[FloatArray], error: FloatArray | None
@@ -381,26 +381,6 @@ class Predictor:
         )
         slots = self._slots[-3:]
         return [d for d, (index, _) in zip(by_sensor, slots, strict=True) if index is not None]
-
-    def _amplitude(
-        self,
-        group: _Group,
-        model_values: Sequence[FloatArray],
-        sensor_values: Sequence[FloatArray],
-        error: FloatArray | None,
-    ) -> tuple[FloatArray, BoolArray | None]:
-        """Return the true amplitude of each row, and whether it exists; None if all do."""
-        amplitude = group.amplitude if self._exact_sensors else group.amplitude / sensor_values[1]
-        if not group.forced:
-            return amplitude if error is None else amplitude * np.exp(-error[..., group.rows]), None
-        drive = self._true_drive(group, sensor_values, error)
-        amplitude = solve(self._model, model_values, group.omega, drive, amplitude)
-        exists = np.isfinite(amplitude)
-        return (amplitude, None) if exists.all() else (np.where(exists, amplitude, 1.0), exists)
-
-
-def _where(exists: BoolArray | None, Z: ComplexArray) -> ComplexArray:
-    return Z if exists is None else np.where(exists, Z, np.nan)
 
 
 def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, FloatArray]:
