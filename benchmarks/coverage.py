@@ -181,7 +181,7 @@ def _at_truth(scenario: Scenario) -> Optimum:
     information = problem.information(scenario.theta, scenario.noise)
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return Optimum(
-        problem=problem, theta=scenario.theta, values=scenario.truth, covariance=covariance,
+        source=problem, theta=scenario.theta, values=scenario.truth, covariance=covariance,
         scale=scenario.noise, scale_known=False, dof=problem.n_residuals - len(scenario.truth),
         cost=0.0, nfev=0, status=Status.CONVERGED, message="", method="",
     )  # fmt: skip

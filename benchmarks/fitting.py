@@ -209,7 +209,9 @@ def _plant_bootstrap() -> Row:
     few = [replace(data, response=drawn) for drawn in responses[:20]]
 
     def ours() -> FloatArray:
-        return solve_many(ProblemBatch.replicates(problem, responses), start=start).values
+        return np.asarray(
+            solve_many(ProblemBatch.replicates(problem, responses), start=start).values
+        )
 
     def peer() -> FloatArray:
         return np.array([fit(table, _PLANT).optimum.values for table in few])

@@ -139,7 +139,8 @@ def deviations(
     begin, parts = time.process_time(), []
     for first in range(0, count, _BATCH):
         optima = solve_many(ProblemBatch(data[first : first + _BATCH], law.asked))
-        error = (optima.values - truth[first : first + _BATCH]) / optima.stderr
+        spread = np.sqrt(np.diagonal(optima.values_covariance, axis1=1, axis2=2))
+        error = (optima.values - truth[first : first + _BATCH]) / spread
         parts.append(np.where(optima.success[:, None], error, np.nan))
     return np.concatenate(parts), time.process_time() - begin
 

@@ -92,7 +92,7 @@ def test_bootstrap_spread_equals_the_stated_one():
     replicates = solve_many(ProblemBatch.replicates(problem, responses), start=found.theta)
     assert replicates.success.all()
     np.testing.assert_allclose(np.cov(replicates.theta.T), found.covariance, rtol=0.12)
-    assert replicates.stderr.shape == (2000, 2)
+    assert replicates.values_covariance.shape == (2000, 2, 2)
 
 
 def test_many_elements_do_not_exhaust_memory():

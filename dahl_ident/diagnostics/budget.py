@@ -253,7 +253,7 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
         if not finite or (positive[name] and u > _DETERMINED):
             lost |= {name}
     # combinations may contain assumed exponents
-    freed = replace(optimum, problem=problem, theta=errors.theta)
+    freed = replace(optimum, source=problem, theta=errors.theta)
     of_optimum = [names.index(name) for name in optimum.names]
     kept = {c.expression for c in optimum.combinations}
     old_names = {

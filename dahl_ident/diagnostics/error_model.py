@@ -229,7 +229,7 @@ class ErrorModel(ErrorContributions):
         """Return an optimum of another problem with the cost there."""
         scale = optimum.scale
         cost = float(problem.quadratic(optimum.theta, scale, self.estimate.loss).cost)
-        return replace(optimum, problem=problem, values=values, cost=scale**2 * cost)
+        return replace(optimum, source=problem, values=values, cost=scale**2 * cost)
 
     @cached_property
     def runs(self) -> RunDeviations | None:

@@ -403,7 +403,7 @@ class RecordAssessment(Assessment):
         share = (0.5 * self.goodness.unexplained_share) ** 0.5 if self.exceeds_noise else _POSITIVE
         optimum = replace(
             self.optimum,
-            problem=problem,
+            source=problem,
             theta=theta,
             values=values,
             covariance=covariance,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 from types import MappingProxyType
@@ -144,7 +144,8 @@ class ConstraintCost:
 class Optimum:
     """The minimum of a problem's sum of squares; arrays are in the order of its `names`."""
 
-    problem: Any
+    source: Problem
+    """The problem, or the batch of which it is that of table `index`."""
     theta: FloatArray
     """Search coordinates, (P,). For an optimum at infinity, a finite point so far out that the
     prediction is that of the limit."""
@@ -172,6 +173,12 @@ class Optimum:
     """The determined combinations where the optimum lies at infinity."""
     constraint_cost: ConstraintCost | None = None
     """None where there are no constraints, or the loss is robust."""
+    index: int = 0
+
+    @cached_property
+    def problem(self) -> Any:
+        """The problem of which this is the optimum."""
+        return self.source.table(self.index)
 
     @property
     def success(self) -> bool:
@@ -191,7 +198,7 @@ class Optimum:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the free parameters."""
-        return tuple(self.problem.names)
+        return self.source.names
 
     @property
     def residuals(self) -> FloatArray:
@@ -265,123 +272,15 @@ class Optimum:
         return MappingProxyType(dict(zip(self.names, errors.tolist(), strict=True)))
 
 
-@dataclass(frozen=True)
-class OptimumBatch:
-    """The minima of S problems of one shape; ``batch[i]`` is the :class:`Optimum` of one.
+class OptimumBatch(tuple[Optimum, ...]):
+    """The optima of problems of one shape; each of their numbers is an array, of all of them."""
 
-    Arrays are those of the optima, stacked along the first axis, S.
-    """
+    __slots__ = ()
 
-    problem: Problem
-    theta: FloatArray
-    values: FloatArray
-    covariance: FloatArray
-    scale: FloatArray
-    dof: IntArray
-    cost: FloatArray
-    nfev: IntArray
-    status: tuple[Status, ...]
-    undetermined: BoolArray
-    method: str
-    loss: str
-    combinations: Mapping[int, tuple[DeterminedCombination, ...]]
-    """Determined combinations, by index, of the optima at infinity."""
-    meanings: Mapping[int, str]
-    """Meanings of their limits, by index; empty where the status states them."""
-
-    def __len__(self) -> int:
-        return len(self.theta)
-
-    def __iter__(self) -> Iterator[Optimum]:
-        return (self[i] for i in range(len(self)))
-
-    def __getitem__(self, index: int) -> Optimum:
-        index = range(len(self))[index]
-        return Optimum(
-            problem=self.problem.table(index),
-            theta=self.theta[index],
-            values=self.values[index],
-            covariance=self.covariance[index],
-            scale=float(self.scale[index]),
-            scale_known=self.scale_known,
-            dof=int(self.dof[index]),
-            cost=float(self.cost[index]),
-            nfev=int(self.nfev[index]),
-            status=self.status[index],
-            message=self._message(index),
-            method=self.method,
-            loss=self.loss,
-            combinations=self.combinations.get(index, ()),
-        )
-
-    @property
-    def scale_known(self) -> bool:
-        """Whether the noise model gives the scale."""
-        return self.problem.scale_known
-
-    @property
-    def success(self) -> BoolArray:
-        """Whether each problem has a finite optimum that was found."""
-        return np.array([status.found_optimum for status in self.status])
-
-    @property
-    def stderr(self) -> FloatArray:
-        """Standard errors of the values, shape (S, P)."""
-        slopes = self.problem.value_slopes(self.theta)
-        return np.sqrt(np.diagonal(propagated(self.covariance, slopes), axis1=1, axis2=2))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the free parameters."""
-        return tuple(self.problem.names)
-
-    @classmethod
-    def joined(cls, problem: Problem, parts: Sequence[OptimumBatch]) -> OptimumBatch:
-        """Return the optima of all parts, one after the other, as those of `problem`."""
-        combinations, meanings, first = {}, {}, 0
-        for part in parts:
-            combinations.update({first + i: c for i, c in part.combinations.items()})
-            meanings.update({first + i: text for i, text in part.meanings.items()})
-            first += len(part)
-        names = ("theta", "values", "covariance", "scale", "dof", "cost", "nfev", "undetermined")
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in names
-        }
-        status = tuple(one for part in parts for one in part.status)
-        return replace(
-            parts[0],
-            problem=problem,
-            status=status,
-            combinations=combinations,
-            meanings=meanings,
-            **arrays,
-        )
-
-    def _message(self, index: int) -> str:
-        """Return the status with the names and numbers that belong to it."""
-        status, problem, values = self.status[index], self.problem, self.values[index]
-        parts = [status.value]
-        if index in self.meanings:
-            ends = {np.inf: "without bound", -np.inf: "without bound below", 0.0: "to zero"}
-            if status is Status.RUNS_AWAY and self.meanings[index]:
-                parts.append(f"In this limit {self.meanings[index]}.")
-            limits = [
-                f"{p.name} {ends[value]}"
-                for p, value in zip(problem.parameters, values.tolist(), strict=True)
-                if np.isinf(value) or (value == 0.0 and p.positive)
-            ]
-            parts.append(f"Here: {', '.join(limits)}.")
-            determined = [
-                f"{c.expression} = {c.value:.4g} ± {c.stderr:.2g}" for c in self.combinations[index]
-            ]
-            if determined:
-                parts.append(f"The limit depends on {', '.join(determined)}.")
-        elif status is Status.SINGULAR:
-            names = np.array(problem.names)[self.undetermined[index]]
-            parts.append(f"Involved: {', '.join(names)}.")
-        elif status is Status.AT_BOUND:
-            parts.append(values_at_bounds(problem, self.theta[index], values))
-        return " ".join(parts)
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return np.array([getattr(optimum, name) for optimum in self])
 
 
 def at_bound(problem: Problem, theta: FloatArray) -> BoolArray:

@@ -169,16 +169,17 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
     if batch.priors and not batch.scale_known:
         at_once = 1  # the scale of each is estimated separately
     at_once = max(1, at_once)
-    parts = []
+    optima = list[Optimum]()
     for first in range(0, S, at_once):
         part = batch.take(slice(first, first + at_once))
         search = TableSearch(part, None, tolerance=_MANY_TABLES)
         if begin is None:
-            parts.append(search.run(global_starts(part)))
+            ends = search.run(global_starts(part))
         else:
             some = begin[first : first + at_once]
-            parts.append(search.run(Starts(np.arange(len(some)), some), starts_given=True))
-    return OptimumBatch.joined(batch, parts)
+            ends = search.run(Starts(np.arange(len(some)), some), starts_given=True)
+        optima += [replace(one, source=batch, index=first + i) for i, one in enumerate(ends)]
+    return OptimumBatch(optima)
 
 
 def repetitions(

@@ -510,4 +510,4 @@ def _density(
     shared = None if errors is None else row_errors(errors)
     prior = joint_prior(wider, stated, wider.to_values(theta), assumed_priors)
     density = Density(wider, prior, likelihood, shared)
-    return density, replace(optimum, problem=wider, theta=theta)
+    return density, replace(optimum, source=wider, theta=theta)

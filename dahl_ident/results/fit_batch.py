@@ -11,7 +11,7 @@ from typing import Any, overload
 import numpy as np
 
 from dahl_ident.arrays import BoolArray, FloatArray
-from dahl_ident.fitting import Optimum, OptimumBatch
+from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
 from dahl_ident.results.fit_result import FitResult
 
@@ -33,8 +33,8 @@ class FitBatch(Sequence[FitResult]):
     (2, ['f_max', 'sigma'])
     """
 
-    optima: OptimumBatch | tuple[Optimum, ...]
-    """Those of the searches alone; of tables, with arrays of all."""
+    optima: Sequence[Optimum]
+    """Those of the searches alone."""
 
     def __len__(self) -> int:
         return len(self.optima)

@@ -176,7 +176,8 @@ def _describe_optimum(optimum: Optimum) -> dict[str, Any]:
     stored = {field.name: getattr(optimum, field.name) for field in fields(optimum)}
     stored |= {"status": optimum.status.name, "combinations": combinations}
     stored["constraint_cost"] = None if cost is None else asdict(cost)
-    del stored["problem"], stored["scale_known"]  # which follow from other entries
+    for name in ("source", "index", "scale_known"):  # which follow from other entries
+        del stored[name]
     return {"names": list(optimum.names), **stored}
 
 
@@ -196,7 +197,7 @@ def _optimum(problem: Problem, stored: Mapping[str, Any]) -> Optimum:
     if cost is not None:
         rise, dof = float(cost["rise"]), float(cost["dof"])
         known["constraint_cost"] = ConstraintCost(tuple(cost["texts"]), rise, dof)
-    return Optimum(problem=problem, scale_known=problem.scale_known, **known)
+    return Optimum(source=problem, scale_known=problem.scale_known, **known)
 
 
 def _describe_data(data: FrequencyResponse) -> dict[str, Any]:
