@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element, Model
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.facts import Mechanics
 from dahl_ident.elements.law_checks import (
     SPREAD,
@@ -32,7 +32,6 @@ from dahl_ident.errors import ModelError
 if TYPE_CHECKING:
     import casadi as ca
 
-    from dahl_ident.elements.parameter import Parameter
     from dahl_ident.engine import Equations
 
 Excitation = Literal["force", "base"]
@@ -54,14 +53,9 @@ def law_equations(element: Element) -> Equations:
 
     from dahl_ident.engine import Equations
 
-    x, v, s, u = (ca.SX.sym(name) for name in ("x", "v", "s", "u"))
-    values = [_symbol(p) for p in element.parameters]
-    states = [ca.SX.sym(f"y{i}") for i in range(element.n_states)]
-    with numpy_names():
-        part = symbolic_mechanics(element, values, x, v, s, states)
+    x, v, s, u, names, states, part = _symbols(as_model(element))
     rates = ca.vertcat(v, 0.0, *part.rates)
-    names = [ca.SX.sym(p.name) if v.is_constant() else v for p, v in _pairs(element, values)]
-    return Equations([x, v, *states], u, s, names, rates, ca.SX(part.force), held=True)
+    return Equations([x, v, *states], u, s, names, rates, part.force, held=True)
 
 
 def plant_equations(
@@ -79,9 +73,39 @@ def plant_equations(
 
     from dahl_ident.engine import Equations
 
+    x, v, s, u, names, states, part = _symbols(model)
+    for element in model.elements:
+        if excitation == "base" and element.is_linear and element.n_states:
+            raise ModelError(
+                f"{element!r} has inertia inside, and how the base moves it is not known; "
+                "build it from Mass, Damper and Spring, or drive the plant by a force"
+            )
+    if not model.has_inertia:
+        raise ModelError(
+            f"{model!r} has no mass, so a force does not determine its motion; add "
+            "Mass(), or give records with measured displacement and force"
+        )
+    applied = u if excitation == "force" else -part.inertia * u
+    acceleration = (applied - part.force) / part.inertia
+    output = {"displacement": x, "velocity": v, "acceleration": acceleration}[channel]
+    rates = ca.vertcat(v, acceleration, *part.rates)
+    return Equations([x, v, *states], u, s, names, rates, output, held=False)
+
+
+def _symbols(model: Model) -> tuple[Any, ...]:
+    """Return x, v, direction, drive, parameters, states, and the sum of the elements' mechanics.
+
+    A parameter that is fixed at 0 or 1 is a number in the equations, which shortens a law.
+    """
+    import casadi as ca
+
     x, v, s, u = (ca.SX.sym(name) for name in ("x", "v", "s", "u"))
-    values = [_symbol(p) for p in model.parameters]
-    inertia, total = ca.SX(0.0), ca.SX(0.0)
+    names = [ca.SX.sym(p.name) for p in model.parameters]
+    values = [
+        ca.SX(float(p.value)) if not p.free and p.value in (0.0, 1.0) else name
+        for p, name in zip(model.parameters, names, strict=True)
+    ]
+    inertia, force = ca.SX(0.0), ca.SX(0.0)
     states: list[ca.SX] = []
     rates: list[ca.SX] = []
     with numpy_names():
@@ -89,38 +113,9 @@ def plant_equations(
             element_states = [ca.SX.sym(f"y{len(states) + i}") for i in range(element.n_states)]
             states += element_states
             part = symbolic_mechanics(element, numbers, x, v, s, element_states)
-            if excitation == "base" and element.is_linear and element.n_states:
-                raise ModelError(
-                    f"{element!r} has inertia inside, and how the base moves it is not known; "
-                    "build it from Mass, Damper and Spring, or drive the plant by a force"
-                )
-            inertia, total = inertia + part.inertia, total + part.force
+            inertia, force = inertia + part.inertia, force + part.force
             rates += part.rates
-    if not model.has_inertia:
-        raise ModelError(
-            f"{model!r} has no mass, so a force does not determine its motion; add "
-            "Mass(), or give records with measured displacement and force"
-        )
-    applied = u if excitation == "force" else -inertia * u
-    acceleration = (applied - total) / inertia
-    output = {"displacement": x, "velocity": v, "acceleration": acceleration}[channel]
-    names = [ca.SX.sym(p.name) if v.is_constant() else v for p, v in _pairs(model, values)]
-    return Equations(
-        [x, v, *states], u, s, names, ca.vertcat(v, acceleration, *rates), output, held=False
-    )
-
-
-def _symbol(parameter: Parameter) -> ca.SX:
-    """Return a parameter's symbol; a number where it is fixed at 0 or 1, which shortens a law."""
-    import casadi as ca
-
-    if not parameter.free and parameter.value in (0.0, 1.0):
-        return ca.SX(float(parameter.value))
-    return ca.SX.sym(parameter.name)
-
-
-def _pairs(element: Element, values: list[ca.SX]) -> Iterator[tuple[Parameter, ca.SX]]:
-    return zip(element.parameters, values, strict=True)
+    return x, v, s, u, names, states, Mechanics(inertia, force, rates)
 
 
 class FirstState:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from keyword import iskeyword
 from numbers import Real
 from typing import Any, Protocol
@@ -30,6 +30,7 @@ _MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
 _REST = len(_MAGNITUDES)  # index of force 0, after all negative ones
 _FRACTIONS = np.linspace(0.0, 1.0, 201)  # of the largest force in each direction
 _LARGEST_FORCE = 1e3  # times the scale: the largest force of a law without full slip
+_FAR_BEYOND = 1e3  # times full slip: up to there a slope that is positive again is a fault
 _EXCEEDED = 1.001  # of the force of full slip, which stages of an integrator may exceed
 _OVERFLOW = 1e6  # times the slope at rest: a law that hardens so far has no full slip
 _ZOOMS = 8  # by 64 each, towards the largest slope; then forces differ by rounding only
@@ -84,55 +85,53 @@ def check_declarations(law: type[ForceLaw]) -> None:
             "dF/dx = slope(force, ...), and add laws in parallel where several forces are needed"
         )
     for p in declared:
-        usable = isinstance(p.name, str) and p.name.isidentifier() and not iskeyword(p.name)
-        if not usable or p.name in _RESERVED:
-            raise ValidationError(
-                f"{name} declares a parameter called {p.name!r}; expected letters, digits and "
-                f"underscores, such as 'f_max', no word of Python, and none of "
-                f"{', '.join(_RESERVED)}"
-            )
-        for what, text in {"unit": p.unit, "description": p.description}.items():
-            if not isinstance(text, str):
-                raise ValidationError(
-                    f"{name}: the {what} of {p.name} is {text!r}; expected text, such as 'N/m'"
-                )
-        for what, pair in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
-            is_pair = isinstance(pair, tuple) and len(pair) == 2
-            if not (is_pair and all(isinstance(x, Real) for x in pair) and pair[0] < pair[1]):
-                raise ValidationError(
-                    f"{name}: {p.name} has the {what} {pair!r}; expected two numbers, the lower "
-                    "one first"
-                )
-        if not (isinstance(p.scan, tuple) and all(isinstance(x, Real) for x in p.scan)):
-            raise ValidationError(
-                f"{name}: {p.name} has the scan {p.scan!r}; expected a tuple of numbers, such as "
-                "(0.5, 1.0, 2.0)"
-            )
-        outside = [value for value in p.scan if not p.lower <= value <= p.upper]
-        if outside:
-            raise ValidationError(
-                f"{name}: {p.name} is scanned at {outside[0]:g}, which is outside its bounds"
-            )
-        if p.transform not in ("log", "linear"):
-            raise ValidationError(
-                f"{name}: the transform of {p.name} is {p.transform!r}; expected 'log' or 'linear'"
-            )
-        side, limit = ("lower", p.lower) if -np.inf < p.lower < 0.0 else ("upper", p.upper)
-        if p.positive and not (side == "upper" and limit > 0.0):
-            raise ValidationError(
-                f"{name}: {p.name} is searched by its logarithm, but its {side} bound is "
-                f'{limit:g}; expected lower=0.0 or more, or transform="linear"'
-            )
-        if not p.is_mechanical:
-            raise ValidationError(
-                f"{name}: the unit of {p.name} is {p.unit!r}; expected a product of powers of "
-                f"{', '.join(UNITS)}, such as 'N/m' or 'N s/m', or '' for a pure number"
-            )
+        for holds, fault in _requirements(p):
+            if not holds:
+                raise ValidationError(f"{name}: {fault}")
     for label, count in Counter(p.name for p in declared).items():
         if count > 1:
             raise ValidationError(
                 f"{name} declares the parameter {label} {count} times; give each its own name"
             )
+
+
+def _requirements(p: Any) -> Iterator[tuple[bool, str]]:
+    """Yield whether what a user declared as a parameter is sound, and the fault if it is not."""
+    usable = isinstance(p.name, str) and p.name.isidentifier() and not iskeyword(p.name)
+    yield (
+        usable and p.name not in _RESERVED,
+        f"a parameter called {p.name!r}; expected letters, digits and underscores, such as "
+        f"'f_max', no word of Python, and none of {', '.join(_RESERVED)}",
+    )
+    for what, text in {"unit": p.unit, "description": p.description}.items():
+        fault = f"the {what} of {p.name} is {text!r}; expected text, such as 'N/m'"
+        yield isinstance(text, str), fault
+    for what, pair in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
+        is_pair = isinstance(pair, tuple) and len(pair) == 2
+        rises = is_pair and all(isinstance(x, Real) for x in pair) and pair[0] < pair[1]
+        yield rises, f"{p.name} has the {what} {pair!r}; expected two numbers, the lower one first"
+    yield (
+        isinstance(p.scan, tuple) and all(isinstance(x, Real) for x in p.scan),
+        f"{p.name} has the scan {p.scan!r}; expected a tuple of numbers, such as (0.5, 1.0, 2.0)",
+    )
+    for value in p.scan:
+        fault = f"{p.name} is scanned at {value:g}, which is outside its bounds"
+        yield p.lower <= value <= p.upper, fault
+    yield (
+        p.transform in ("log", "linear"),
+        f"the transform of {p.name} is {p.transform!r}; expected 'log' or 'linear'",
+    )
+    side, limit = ("lower", p.lower) if -np.inf < p.lower < 0.0 else ("upper", p.upper)
+    yield (
+        not p.positive or (side == "upper" and limit > 0.0),
+        f"{p.name} is searched by its logarithm, but its {side} bound is {limit:g}; expected "
+        'lower=0.0 or more, or transform="linear"',
+    )
+    yield (
+        p.is_mechanical,
+        f"the unit of {p.name} is {p.unit!r}; expected a product of powers of {', '.join(UNITS)}, "
+        "such as 'N/m' or 'N s/m', or '' for a pure number",
+    )
 
 
 def check_slope(law: _SlopeLaw) -> None:
@@ -324,12 +323,9 @@ class _Trial:
             forces = np.concatenate([-behind[:0:-1], ahead, _EXCEEDED * ahead[-1:]])
             slopes = self._slope(direction * forces, direction)
             steepest, peak = self._peak(forces, slopes, direction)
-            forces, slopes = np.append(steepest, forces), np.append(peak, slopes)
-            objection = (
-                self._not_finite(forces, slopes, direction)
-                or self._positive_again(side, direction)
-                or self._not_positive(forces[:-1], slopes[:-1], direction)
-            )
+            objection = self._not_finite(
+                np.append(steepest, forces), np.append(peak, slopes), direction
+            ) or self._not_positive(forces, slopes, side, direction)
             if objection:
                 return objection
         return ""
@@ -377,40 +373,33 @@ class _Trial:
             "m = 1 - direction*force/f_max"
         )
 
-    def _not_positive(self, forces: FloatArray, slopes: FloatArray, direction: float) -> str:
+    def _not_positive(
+        self, forces: FloatArray, slopes: FloatArray, side: int, direction: float
+    ) -> str:
+        """Return the objection to a negative slope at smaller forces than a positive one."""
         if not self._rest_slope > 0.0:
             where = self._where(0.0, direction)
             return (
                 f"is {self._rest_slope:.4g} N/m {where}; expected a positive slope at rest and "
                 "up to full slip"
             )
-        negative = slopes < -_SLOPE_ROUNDING * np.max(np.abs(slopes))
-        before_slip = np.flatnonzero(negative & (forces < forces[-1] * (1.0 - 1e-3)))
-        if not before_slip.size:
-            return ""
-        worst = before_slip[np.argmin(slopes[before_slip])]
-        where = self._where(direction * forces[worst], direction)
-        return (
-            f"is {slopes[worst]:.4g} N/m, negative before full slip, {where}; expected a positive "
-            "slope until full slip, also after the direction has changed"
-        )
-
-    def _positive_again(self, side: int, direction: float) -> str:
-        """Return the objection to a slope that is negative, and positive at larger forces."""
-        limit, slopes, forces = self._limits[side], self._slopes[side], self._forces
-        near = (forces > limit) & (forces < 1e3 * limit)
+        smallest = _SLOPE_ROUNDING * np.max(np.abs(slopes))
+        limit, farther = self._limits[side], self._forces
+        beyond = (farther > limit) & (farther < _FAR_BEYOND * limit)
+        forces = np.concatenate([forces, farther[beyond]])
+        slopes = np.concatenate([slopes, self._slopes[side][beyond]])
         with np.errstate(invalid="ignore"):
-            smallest = _SLOPE_ROUNDING * self._rest_slope
-            negative = np.flatnonzero(near & (slopes < -smallest))
-            later = np.flatnonzero(near & (slopes > smallest))
-        negative = negative[negative < later.max(initial=-1)]
+            negative = np.flatnonzero(slopes < -smallest)
+            positive = np.flatnonzero(slopes > smallest)
+        negative = negative[negative < positive.max(initial=-1)]
         if not negative.size:
             return ""
         worst = negative[np.argmin(slopes[negative])]
         return (
             f"is {slopes[worst]:.4g} N/m, negative before full slip, "
             f"{self._where(direction * forces[worst], direction)}, and positive again at larger "
-            "forces; expected a positive slope until full slip"
+            "forces; expected a positive slope until full slip, also after the direction has "
+            "changed"
         )
 
     def constant(self) -> str:
