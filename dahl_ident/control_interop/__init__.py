@@ -29,19 +29,19 @@ if TYPE_CHECKING:
         response_branches,
     )
     from dahl_ident.control_interop.linearization import (
+        FrictionNonlinearity,
         LoopMargins,
         closed_loop_response,
         equivalent_plant,
         loop_margins,
     )
-    from dahl_ident.control_interop.nonlinearity import FrictionNonlinearity
     from dahl_ident.control_interop.steady_response import SteadyResponse, response
 
 _FILES = {
     "levels": "Branches LevelResponses level_responses response_branches",
     "cycles": "LimitCycle LimitCycles limit_cycles",
-    "linearization": "LoopMargins closed_loop_response equivalent_plant loop_margins",
-    "nonlinearity": "FrictionNonlinearity",
+    "linearization": "FrictionNonlinearity LoopMargins closed_loop_response equivalent_plant "
+    "loop_margins",
     "steady_response": "SteadyResponse response",
 }
 _HOME = {name: file for file, names in _FILES.items() for name in names.split()}

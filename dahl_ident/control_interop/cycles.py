@@ -32,11 +32,12 @@ from scipy.optimize import root
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.linearization import (
+    friction_alone,
+    friction_and_slope,
     has_polynomials,
     known_range,
     rational_stiffness,
 )
-from dahl_ident.control_interop.nonlinearity import friction_alone, friction_and_slope
 from dahl_ident.elements.driven_motion import NEUTRAL, Steady, obstacle
 from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.equations import law_equations, plant_equations

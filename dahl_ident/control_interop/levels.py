@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.cycles import stiffness_of, stiffness_slope
-from dahl_ident.control_interop.linearization import split
-from dahl_ident.control_interop.nonlinearity import friction_and_slope
+from dahl_ident.control_interop.linearization import friction_and_slope, split
 from dahl_ident.control_interop.steady_response import SteadyResponse, response
 from dahl_ident.data.columns import CONTROLLED, one_of
 from dahl_ident.elements.driven_motion import NEUTRAL, Steady

@@ -15,7 +15,7 @@ from dahl_ident.data.columns import one_of
 from dahl_ident.data.record import at_even_times, unbroken
 from dahl_ident.data.rows import one_run
 from dahl_ident.elements import Element, Friction, Model, Parameter
-from dahl_ident.elements.coefficients import Coefficients
+from dahl_ident.elements.driven_motion import Coefficients
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.elements.parameter import Dimension
