@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from operator import attrgetter
@@ -50,11 +50,6 @@ def frozen_copy(array: NDArray[Any]) -> NDArray[Any]:
 def frozen_mapping(value: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     """Return a read-only copy of a mapping, or None for None."""
     return None if value is None else MappingProxyType(dict(value))
-
-
-def plain_mappings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return constructor arguments with plain dicts, because mapping proxies cannot be pickled."""
-    return {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in pairs}
 
 
 def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:

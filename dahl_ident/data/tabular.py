@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.columns import plain_mappings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -125,7 +124,10 @@ class Tabular(ABC):
         return as_html(*self._summary())
 
     def __reduce__(self) -> tuple[Any, ...]:
-        arguments = plain_mappings((f.name, getattr(self, f.name)) for f in fields(self))
+        arguments = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name in ("quality", "provenance"):  # mapping proxies cannot be pickled
+            if arguments.get(name) is not None:
+                arguments[name] = dict(arguments[name])
         return partial(type(self), **arguments), ()
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:

@@ -53,19 +53,6 @@ _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
 _WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are no coincidence
 _MISSING_CYCLES = 3.0  # largest number between two parts of one level
-_MEANS = (
-    "bias_real",
-    "bias_imag",
-    "displacement_share",
-    "force_share",
-    "displacement_distortion",
-    "force_distortion",
-    "asymmetry",
-    "displacement_steps",
-    "force_steps",
-    "displacement_clipped",
-    "force_clipped",
-)
 _PERIOD_CHANGE = 0.03  # largest relative change from cycle to cycle of a sine (median by energy)
 _AMPLITUDE_CHANGE = 0.1  # largest change likewise; at a resonance, amplitudes change faster
 _SWEEP_RANGE = 0.2  # least change of log period over a sweep; less may be chance
@@ -478,11 +465,16 @@ def _combined(a: Point, b: Point) -> Point:
         verdicts.append("; ".join(part for part in objections if part != "good") or "good")
     quality = {
         **a.quality,
-        **{name: mean(a.quality[name], b.quality[name]) for name in _MEANS},
+        **{
+            name: mean(value, b.quality[name])
+            for name, value in a.quality.items()
+            if np.asarray(value).dtype.kind == "f"
+        },
         "settled": a.quality["settled"] & b.quality["settled"],
         "more_periods": np.maximum(a.quality["more_periods"], b.quality["more_periods"]),
         "num_periods": periods,
         "settling_periods": settling,
+        "start_time": a.quality["start_time"],
         "end_time": b.quality["end_time"],
         "verdict": verdicts,
     }

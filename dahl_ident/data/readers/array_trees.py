@@ -116,24 +116,15 @@ def read_npy(file: File) -> RawFile:
     end = getattr(array, "offset", 0) + array.nbytes if mapped else stream.tell()
     if file.length != end:
         raise ValueError(f"{file.length - end} bytes behind its array; were some added?")
-    return tree_source(file, "NumPy .npy", _fields("data", array, file if mapped else None))
+    return tree_source(file, "NumPy .npy", _fields("data", array))
 
 
-def _fields(path: str, array: NDArray[Any], mapped: File | None = None) -> Iterator[Leaf]:
-    """Yield an array, or each field of a structured one; those of a mapped file are read later."""
-
-    def read(field: str | None, rows: slice) -> NDArray[Any]:
-        assert mapped is not None  # other arrays are in memory
-        content = np.load(mapped.stream(), mmap_mode="r", allow_pickle=False)
-        return np.array((content if field is None else content[field])[rows])
-
-    for field in array.dtype.names or (None,):
-        values: Any = array if field is None else array[field]
-        where = path if field is None else f"{path}.{field}"
-        if mapped is not None and values.ndim:
-            what = f"{mapped.name}: {where}"
-            values = Stored(values.shape, values.dtype, partial(read, field), what)
-        yield where, values, None
+def _fields(path: str, array: NDArray[Any]) -> Iterator[Leaf]:
+    """Yield an array, or each field of a structured one."""
+    for field in array.dtype.names or ():
+        yield f"{path}.{field}", array[field], None
+    if array.dtype.names is None:
+        yield path, array, None
 
 
 def read_matlab(file: File) -> RawFile:
