@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.errors import ExtractionError, Placeholder, argument
 from dahl_ident.extraction.cycles import (
     Cycles,
@@ -25,18 +26,12 @@ from dahl_ident.extraction.cycles import (
     Span,
     find_cycles,
     find_spans,
-    groups_of_cycles,
     sine_in_each,
 )
 from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
     Segment,
-    checked_inverse,
-    column_blocks,
-    columns,
     estimate_frequency,
-    is_solvable,
-    normal_equations,
     steady_segment,
     track_phase,
 )
@@ -188,30 +183,93 @@ def _steady_part(
 
     `segment` is the part with the phase of a steady sine; `room` bounds its growth.
     """
-    edges = _cycle_edges(segment)
-    start, stop = part.start, part.stop
-    count, fewer = edges.size - 1, np.zeros(2, dtype=np.intp)
-    while True:
-        inside = _inside(segment, edges)
-        if inside is None or 2 * edges.size <= count:
+    more = 2.0 * np.pi / segment.omega * np.arange(1.0, _MOST_CYCLES_MORE + 1.0)
+    begin, end = time[part.start], time[part.stop - 1]
+    inner = _cycle_edges(segment)[1:-1]
+    before = np.searchsorted(time, np.concatenate([begin - more[::-1], [begin], inner]))
+    after = np.searchsorted(time, np.concatenate([[end], end + more]), side="right")
+    cuts = np.concatenate([before, after]).clip(room.start, room.stop)
+    where = slice(int(cuts[0]), int(cuts[-1]))
+    theta = np.asarray(segment.phase((time[where] - segment.centre) / segment.half_width))
+    cycles = _EachCycle(theta, motion[where], cuts - cuts[0])
+    phasor, variance = cycles.fits
+    first, last = begun, ended = more.size, phasor.size - more.size
+    while (stray := cycles.strays(first, last)) is not None:
+        early, late = stray[[first, last - 1]].tolist()
+        if 2 * (last - first + 1) <= ended - begun or not (early or late):
             break
-        if fewer.max() > _MOST_CYCLES_LESS:
-            return _extended(time, motion, segment, part, room, None)
-        second, last = np.searchsorted(time, edges[[1, -2]]).tolist()
-        early = inside.strays(time[start:second], motion[start:second])
-        late = inside.strays(time[last:stop], motion[last:stop])
-        if not early and not late:
+        first, last = first + early, last - late
+        if max(first - begun, ended - last) > _MOST_CYCLES_LESS:
+            first, last, stray = begun, ended, None
             break
-        start, stop = (second if early else start), (last if late else stop)
-        edges = edges[int(early) : edges.size - int(late)]
-        fewer += [early, late]
-    if inside is not None:  # enough cycles remain; those next to stray ones deviate as well
-        start = int(np.searchsorted(time, edges[1])) if start > part.start else start
-        stop = int(np.searchsorted(time, edges[-2])) if stop < part.stop else stop
-    room = slice(
-        room.start if start == part.start else start, room.stop if stop == part.stop else stop
-    )
-    return _extended(time, motion, segment, slice(start, stop), room, inside)
+    if stray is not None:  # enough cycles remain; those next to stray ones deviate as well
+        first, last = first + (first > begun), last - (last < ended)
+    known = phasor[begun:ended][np.isfinite(phasor[begun:ended])]
+    mean = known.sum() / max(known.size, 1)
+    misfit = np.sqrt(variance + cycles.power(phasor - mean) / cycles.count)
+    fits = misfit <= 1.5 * misfit[first] + _STRAYING * abs(mean)
+    if stray is not None:
+        fits &= ~stray
+    if first == begun:
+        while first > 0 and fits[first - 1]:
+            first -= 1
+    if last == ended:
+        while last < phasor.size and fits[last]:
+            last += 1
+    return slice(int(cuts[first]), int(cuts[last]))
+
+
+@dataclass(frozen=True)
+class _EachCycle:
+    """Samples with their phase, cut into cycles that may be incomplete at the ends."""
+
+    theta: FloatArray
+    motion: FloatArray
+    cuts: IntArray
+
+    @cached_property
+    def count(self) -> FloatArray:
+        """Number of samples of each cycle, or 1 if there are none."""
+        return np.maximum(np.diff(self.cuts), 1).astype(np.float64)
+
+    @cached_property
+    def fits(self) -> tuple[ComplexArray, FloatArray]:
+        """Phasor and residual variance of each cycle; NaN where samples are too few."""
+        full = self.count >= _SAMPLES_PER_CYCLE
+        bounds = np.column_stack([self.cuts[:-1], self.cuts[1:]])[full].ravel()
+        n = np.diff(self.cuts)[full]
+        phasor, variance = np.full((2, full.size), np.nan + 0j)
+        phasor[full], variance[full] = sine_in_each(self.theta, self.motion, bounds, n)
+        return phasor, variance.real
+
+    def power(self, sine: ComplexArray) -> FloatArray:
+        """Return the sum of squares of a sine in each cycle, without its mean; 0 for NaN."""
+        size = np.repeat(np.nan_to_num(sine), np.diff(self.cuts))
+        values = (size * np.exp(1j * self.theta)).real
+        running = np.cumsum(np.pad([values, values**2], ((0, 0), (1, 0))), axis=1)
+        total, square = np.diff(running[:, self.cuts], axis=1)
+        return np.asarray(square - total**2 / self.count)
+
+    def strays(self, first: int, last: int) -> BoolArray | None:
+        """Return which cycles deviate from a sine that changes linearly in some cycles.
+
+        Those at the ends are not part of the sine; None if too few others remain.
+        """
+        excluded = min(_END_CYCLES, (last - first) // _CYCLES_PER_END_CYCLE)
+        phasor, n = self.fits[0], self.count
+        inner = np.arange(first + excluded, last - excluded)
+        inner = inner[np.isfinite(phasor[inner])]
+        dof = 2 * inner.size - 4
+        if excluded == 0 or dof < 2:
+            return None
+        k = np.arange(n.size) - np.average(inner, weights=n[inner])
+        sine = np.polyval(np.polyfit(k[inner], phasor[inner], 1, w=np.sqrt(n[inner])), k)
+        explained = self.power(phasor - sine)
+        leverage = n * (1.0 / n[inner].sum() + k**2 / (n[inner] @ k[inner] ** 2))
+        scatter = (1.0 + leverage) * explained[inner].sum() / dof
+        bound = 2.0 * _highest_by_chance(_STRAY_BY_CHANCE, dof)
+        least = 0.5 * n * (_LEAST_DRIFT * np.abs(sine).mean()) ** 2
+        return np.asarray(explained > np.maximum(bound * scatter, least))
 
 
 def _highest_by_chance(share: float, dof: int) -> float:
@@ -223,98 +281,3 @@ def _cycle_edges(segment: Segment) -> FloatArray:
     end = segment.time[-1] + 0.5 * segment.sample_phase / segment.omega
     cycle = 2.0 * np.pi / segment.omega
     return np.asarray(end - cycle * np.arange(segment.whole_cycles, -1.0, -1.0))
-
-
-@dataclass(frozen=True)
-class _Inside:
-    """The sine of the inner cycles, which may change linearly, and the variance about it."""
-
-    segment: Segment
-    coefficients: FloatArray
-    inverse: FloatArray
-    variance: float
-    dof: int
-
-    def strays(self, time: FloatArray, motion: FloatArray) -> bool:
-        """Return whether samples of the record deviate significantly from the sine."""
-        tau = (time - self.segment.centre) / self.segment.half_width
-        basis = columns(np.asarray(self.segment.phase(tau)), tau, 1, 1)
-        sine = basis[2:4] - basis[2:4].mean(axis=1, keepdims=True)  # the mean may wander
-        inverse = np.linalg.pinv(sine @ sine.T)
-        products = sine @ (motion - self.coefficients @ basis)
-        explained = float(products @ inverse @ products)
-        cross = sine @ basis.T
-        fitted = 0.5 * float(np.trace(inverse @ cross @ self.inverse @ cross.T))
-        bound = _highest_by_chance(_STRAY_BY_CHANCE, self.dof)
-        amplitude = float(np.hypot(*self.coefficients[2:4]))
-        least = 0.5 * time.size * (_LEAST_DRIFT * amplitude) ** 2
-        return bool(explained > max(2.0 * bound * (1.0 + fitted) * self.variance, least))
-
-
-def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
-    """Return the sine of all cycles except those at the ends, None if too few remain."""
-    excluded = min(_END_CYCLES, (edges.size - 1) // _CYCLES_PER_END_CYCLE)
-    if excluded == 0:
-        return None
-    cuts = np.searchsorted(segment.time, edges[excluded:-excluded])
-    within = slice(int(cuts[0]), int(cuts[-1]))
-    blocks = column_blocks(segment.theta[within], segment.tau[within], 1, 1)
-    normal, right = normal_equations(segment.channels[:1, within], 6, blocks)
-    if not is_solvable(normal):
-        return None
-    inverse = np.asarray(np.linalg.inv(normal), np.float64)
-    coefficients = inverse @ right[:, 0]
-    sums = np.zeros((5, cuts.size - 1))
-    for first, last in groups_of_cycles(cuts):
-        part = slice(int(cuts[first]), int(cuts[last]))
-        basis = columns(segment.theta[part], segment.tau[part], 1, 1)
-        residual = segment.channels[0, part] - coefficients @ basis
-        cos, sin = basis[2:4]
-        products = np.stack([cos * cos, sin * sin, cos * sin, cos * residual, sin * residual])
-        running = np.cumsum(np.pad(products, ((0, 0), (1, 0))), axis=1)
-        sums[:, first:last] = np.diff(running[:, cuts[first : last + 1] - cuts[first]], axis=1)
-    cc, ss, cs, c, s = sums
-    determinant = cc * ss - cs**2
-    full = determinant > 0.1 * cc * ss  # a cycle without samples carries no information
-    dof = 2 * int(full.sum()) - 4
-    if dof < 2:
-        return None
-    explained = (ss * c**2 + cc * s**2 - 2.0 * cs * c * s)[full] / determinant[full]
-    return _Inside(segment, coefficients, inverse, float(explained.sum()) / dof, dof)
-
-
-def _extended(
-    time: FloatArray,
-    motion: FloatArray,
-    segment: Segment,
-    part: slice,
-    room: slice,
-    inside: _Inside | None,
-) -> slice:
-    """Return the slice extended by adjacent cycles that fit the segment's sine."""
-    thinned = segment.thinned()
-    basis = columns(thinned.theta, thinned.tau, 1)
-    fitted = checked_inverse(basis @ basis.T, thinned) @ (basis @ thinned.channels[0])
-    cycle = 2.0 * np.pi / segment.omega
-
-    def misfit(where: slice) -> float:
-        tau = (time[where] - segment.centre) / segment.half_width
-        model = fitted @ columns(np.asarray(segment.phase(tau)), tau, 1)
-        return float(np.sqrt(np.mean((motion[where] - model) ** 2)))
-
-    start, stop = part.start, part.stop
-    within = slice(start, int(np.searchsorted(time, time[start] + cycle)))
-    allowed = 1.5 * misfit(within) + _STRAYING * float(np.hypot(*fitted[2:]))
-
-    def fits(where: slice) -> bool:
-        strays = inside is not None and inside.strays(time[where], motion[where])
-        return misfit(where) <= allowed and not strays
-
-    for _ in range(_MOST_CYCLES_MORE):
-        earlier = max(int(np.searchsorted(time, time[start] - cycle)), room.start)
-        if earlier < start and fits(slice(earlier, start)):
-            start = earlier
-        later = min(int(np.searchsorted(time, time[stop - 1] + cycle, side="right")), room.stop)
-        if later > stop and fits(slice(stop, later)):
-            stop = later
-    return slice(start, stop)
