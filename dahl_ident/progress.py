@@ -18,8 +18,8 @@ class Show(Protocol):
 
 
 @contextmanager
-def spinner(task: str) -> Iterator[Show]:
-    """Show on standard error, after two seconds, that a task is running, and the time elapsed.
+def spinner(task: str, patience: float = PATIENCE) -> Iterator[Show]:
+    """Show on standard error, after some seconds, that a task is running, and the time elapsed.
 
     Standard output is for results. The yielded function reports progress; with the number of steps,
     the remaining time is shown as well.
@@ -36,7 +36,7 @@ def spinner(task: str) -> Iterator[Show]:
     def show(words: str, done: float = 0.0, total: float | None = None) -> None:
         bar.update(number, description=f"{task}{words}", completed=done, total=total)
 
-    timer = threading.Timer(PATIENCE, bar.start)
+    timer = threading.Timer(patience, bar.start)
     timer.daemon = True
     timer.start()
     try:

@@ -18,6 +18,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import gammainccinv
 
 from dahl_ident.arrays import FloatArray, cholesky_root, positive_number
@@ -300,7 +301,12 @@ def starting_points(
 ) -> FloatArray:
     """Return `walkers` points of finite density, (walkers, D)."""
     theta, covariance = centre_and_covariance(density, optimum, random)
-    centre, root = _centre_and_root(density, theta, covariance)
+    centre, root = theta, cholesky_root(covariance)
+    if density.has_scale:
+        assert isinstance(density, Density)
+        centre = np.append(theta, np.log(_scale(density, theta)))
+        dof = density.problem.n_residuals - len(theta)
+        root = block_diag(root, 1.0 / np.sqrt(2.0 * dof))
     spread = np.full(walkers, _START_SPREAD)
     points = np.empty((walkers, len(centre)))
     missing = np.arange(walkers)
@@ -354,21 +360,6 @@ def _refuse_exclusion(density: LogDensity, centre: FloatArray, covariance: Float
             f"the priors exclude what the data show: {'; '.join(outside)}. Check the prior, its "
             "unit, and the data; to keep the parameter there all the same, fix it"
         )
-
-
-def _centre_and_root(
-    density: LogDensity, theta: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the centre and a root of the covariance, with ln s if it is sampled."""
-    P = len(theta)
-    root = cholesky_root(covariance)
-    if not density.has_scale:
-        return theta, root
-    assert isinstance(density, Density)
-    with_scale = np.zeros((P + 1, P + 1))
-    with_scale[:P, :P] = root
-    with_scale[P, P] = 1.0 / np.sqrt(2.0 * (density.problem.n_residuals - P))
-    return np.append(theta, np.log(_scale(density, theta))), with_scale
 
 
 def _inside(density: Density, optimum: Optimum | None, random: np.random.Generator) -> FloatArray:

@@ -207,7 +207,7 @@ def _sample(posterior: Posterior) -> list[str]:
         how = ["--seed", str(posterior.seed), "--steps", str(posterior.steps)]
     return [
         "sample",
-        *_model(posterior.given_problem),
+        *_model((posterior.fit or posterior).problem),
         "--noise",
         posterior.problem.noise,
         *how,

@@ -42,7 +42,7 @@ from dahl_ident.problem import (
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
-from dahl_ident.results.progress import fit_progress, grid_progress, progress_bar
+from dahl_ident.results.progress import chain_progress, fit_progress, grid_progress
 from dahl_ident.sensors import Sensors
 
 if TYPE_CHECKING:
@@ -430,7 +430,7 @@ def posterior(
         ensembles=ensembles,
     )
     start = partial(starting_points, density, optimum)
-    with progress_bar(settings) if progress else nullcontext() as bar:
+    with chain_progress(settings) if progress else nullcontext() as bar:
         sample = sample_chain(
             density,
             start,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,11 +33,14 @@ def draw(fit: FittedModel, kind: str | None, ax: Any, record: int) -> Any:
     """Draw a fit in one of the kinds that its data have, by default the fit over the data."""
     of_table = fit.problem.response is not None
     kinds: dict[str, Callable[[], Any]] = {
-        "fit": lambda: _fit_of_table(fit, ax) if of_table else _fit_of_record(fit, ax, record),
+        "fit": lambda: _fit_of_record(fit, ax, record),
         "residuals": lambda: draw_residuals(fit, None, ax, record),
         "budget": lambda: draw_budget(fit.budget(), ax),
     }
-    if not of_table:
+    if of_table:
+        stds, fitted = partial(_stds, fit), partial(_curve, fit)
+        kinds["fit"] = lambda: curves.draw(fit.data, ax, stds=stds, fitted=fitted)
+    else:
         kinds["loop"] = lambda: _draw_loop(fit, ax, record)
     if kind is not None and kind not in kinds:
         raise ValidationError(f"kind is {kind!r}; expected one of {choices(kinds, kind)}")
@@ -54,16 +58,6 @@ def draw_budget(budget: Budget, ax: Axes | None = None) -> Axes:
     """Draw the share of each source in the variance of each parameter."""
     shares = [(p.name, row.source, row.share) for p in budget.parameters for row in p.rows]
     return plot_budget(shares, ax=ax)
-
-
-def _fit_of_table(fit: FittedModel, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
-    """Draw data with error bars, and the fit with its band, over amplitude or frequency."""
-    return curves.draw(
-        fit.data,
-        ax,
-        stds=lambda part: _stds(fit, part),
-        fitted=lambda part, over_frequency: _curve(fit, part, over_frequency),
-    )
 
 
 def standardized_residuals(fit: FittedModel) -> FloatArray:

@@ -22,17 +22,16 @@ Predicted responses and their bands are computed at the draws, without lineariza
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray, IntArray
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.bayes.density import SCALE, TAIL_DOF, Density
 from dahl_ident.bayes.priors import JointPrior, ParameterPrior
 from dahl_ident.bayes.sample import ChainSample
-from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.storage import library
 from dahl_ident.diagnostics.checks import assumptions
 from dahl_ident.diagnostics.confidence_levels import checked_levels
@@ -81,7 +80,10 @@ def predictive_checks(
     theta, scale = density.split(points)
     y = _whitened(density, theta)
     y = np.broadcast_to(y, (len(theta), density.problem.n_residuals // 2)) / scale[:, None]
-    order = _neighbours(density.problem.data)
+    data = density.problem.data
+    level = data.drive if data.amplitude is None else data.amplitude
+    assert level is not None
+    order = np.lexsort((level, data.frequency_hz, data.harmonic))
     noise = replicated_noise(density, y.shape, random)
     checks = []
     for name, statistic in _STATISTICS.items():
@@ -124,27 +126,15 @@ def pointwise_log_likelihood(density: Density, points: FloatArray) -> FloatArray
     return np.asarray(rows + constant[:, None] / z.shape[1])
 
 
-def _neighbours(data: FrequencyResponse) -> IntArray:
-    """Return the rows in order of harmonic, frequency and amplitude."""
-    amplitude = data.drive if data.amplitude is None else data.amplitude
-    assert amplitude is not None
-    return np.asarray(np.lexsort((amplitude, data.frequency_hz, data.harmonic)))
-
-
 def _size(y: ComplexArray) -> FloatArray:
     return np.asarray(np.sum(np.abs(y) ** 2, axis=1))
 
 
-def _largest(y: ComplexArray) -> FloatArray:
-    z = np.abs(y) ** 2
-    return np.asarray(z.max(axis=1) / z.mean(axis=1))
-
-
-def _correlation(y: ComplexArray) -> FloatArray:
-    return np.asarray(np.sum((y[:, 1:] * y[:, :-1].conj()).real, axis=1) / _size(y))
-
-
-_STATISTICS = {"size": _size, "largest": _largest, "neighbours": _correlation}
+_STATISTICS: Mapping[str, Callable[[ComplexArray], FloatArray]] = {
+    "size": _size,
+    "largest": lambda y: np.max(np.abs(y) ** 2, axis=1) / (_size(y) / y.shape[1]),
+    "neighbours": lambda y: np.sum((y[:, 1:] * y[:, :-1].conj()).real, axis=1) / _size(y),
+}
 
 
 @dataclass(frozen=True)

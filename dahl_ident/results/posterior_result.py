@@ -117,11 +117,6 @@ class Posterior(Result):
         return list(self.names)
 
     @property
-    def given_problem(self) -> Any:
-        """The problem without assumed exponents as parameters."""
-        return (self.fit or self).problem
-
-    @property
     def optimum(self) -> Optimum | None:
         """The least-squares optimum from which the search started; None with too few data."""
         return None if self.fit is None else self.fit.optimum

@@ -10,33 +10,18 @@ from dahl_ident.progress import spinner
 from dahl_ident.units import counted, percent
 
 
-def expected_steps(settings: ChainSettings, verdict: Convergence | None) -> int | None:
-    """Return the expected total number of steps; None before the first verdict."""
-    if settings.steps is not None:
-        return settings.steps
-    if verdict is None or not verdict.usable:
-        return None
-    kept = verdict.steps - verdict.discard
-    needed = max(LENGTH * verdict.tau.max(), kept * settings.ess / verdict.ess.min())
-    return min(int(verdict.discard + needed) + 1, settings.max_steps)
-
-
 @contextmanager
-def progress_bar(settings: ChainSettings) -> Iterator[Listener]:
-    """Yield a listener that updates a bar."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    columns = (TextColumn("sampling"), BarColumn(), MofNCompleteColumn(), Remaining())
-    console = Console(stderr=True, force_jupyter=False)  # standard output is for results
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("sampling", total=settings.steps)
+def chain_progress(settings: ChainSettings) -> Iterator[Listener]:
+    """Yield a listener that shows the number of steps, and the expected total once it is known."""
+    with spinner("sampling", patience=0.0) as show:
 
         def update(chain: Chain, verdict: Convergence | None) -> None:
-            total = expected_steps(settings, verdict)
-            steps = chain.steps
-            bar.update(task, completed=steps, total=None if total is None else max(total, steps))
+            total = settings.steps
+            if total is None and verdict is not None and verdict.usable:
+                kept = verdict.steps - verdict.discard
+                needed = max(LENGTH * verdict.tau.max(), kept * settings.ess / verdict.ess.min())
+                total = max(min(verdict.discard + int(needed) + 1, settings.max_steps), chain.steps)
+            show(f" {chain.steps}/{total or '?'}", chain.steps, total)
 
         yield update
 
