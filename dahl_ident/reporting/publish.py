@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,21 +18,10 @@ from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import make_folder, place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import ValidationError, argument
 from dahl_ident.reporting.comparison import of_kind
-from dahl_ident.reporting.document import (
-    Block,
-    Bullets,
-    Cell,
-    Document,
-    Listing,
-    Paragraph,
-    Picture,
-    Section,
-    TextTable,
-)
+from dahl_ident.reporting.document import Document
 from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import FitResult, Posterior
 
-BLANK = "________________"
 SCHEMA = 2  # version of the JSON report, raised when readers have to change
 _LONGEST_TITLE = 200  # characters
 FORMATS = (".html", ".pdf", ".md", ".json")
@@ -207,17 +196,14 @@ def machine_readable(whole: Document) -> bytes:
 
 def html(document: Document) -> bytes:
     """Return the page; text is escaped, and the page's security policy forbids network access."""
-    package = files("dahl_ident.reporting")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
-    page = environment.from_string((package / "page.html.j2").read_text(encoding="utf-8"))
-    return page.render(
+    return _rendered(
+        "page.html.j2",
+        {"autoescape": True},
         document=document,
         foot=_css_text(f"{document.title} {document.identity}".strip()),
-        style=(package / "page.css").read_text(encoding="utf-8"),
-        script=(package / "page.js").read_text(encoding="utf-8"),
-    ).encode(errors="replace")
+        style=_file("page.css"),
+        script=_file("page.js"),
+    )
 
 
 def _css_text(text: str) -> str:
@@ -227,57 +213,22 @@ def _css_text(text: str) -> str:
 
 def markdown(document: Document, folder: str) -> bytes:
     """Return the text, with links to the pictures as PNG files in `folder`."""
-    lines = [f"# {_escaped(document.title)}", f"**{document.mark}.**"]
-    lines += [_escaped(line) for line in document.verdict]
-    if document.header:
-        rows = [
-            f"| {name} | {_escaped('; '.join(texts)) or BLANK} |" for name, texts in document.header
-        ]
-        lines.append("\n".join(("| | |", "| --- | --- |", *rows)))
-    if document.identity:
-        lines.append(_escaped(document.identity))
-    for section in _with_signature(document):
-        lines.append(f"## {_escaped(section.title)}")
-        lines += [text for block in section.blocks if (text := _block(block, folder))]
-    return ("\n\n".join(lines) + "\n").encode(errors="replace")
+    options = {"lstrip_blocks": True, "finalize": _escaped}
+    text = _rendered("page.md.j2", options, document=document, folder=folder)
+    return re.sub(rb" +$", b"", text, flags=re.MULTILINE).rstrip() + b"\n"
 
 
-def _with_signature(document: Document) -> Iterator[Section]:
-    """Yield the sections, with a field for the signature before the first of the details."""
-    sections = document.sections
-    name = ", ".join(document.signatory) or BLANK
-    signature = Section("Signature", (Paragraph(f"Date {BLANK} Name {name} Signature {BLANK}"),))
-    for before, section in zip((None, *sections), sections, strict=False):
-        if section.details and not (before and before.details):
-            yield signature
-        yield section
+def _rendered(name: str, options: Mapping[str, Any], **values: Any) -> bytes:
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, **options)
+    return environment.from_string(_file(name)).render(**values).encode(errors="replace")
 
 
-def _block(block: Block, folder: str) -> str:
-    match block:
-        case Paragraph(text):
-            return _escaped(text)
-        case Bullets(items):
-            return "\n".join(f"- {_escaped(item)}" for item in items)
-        case Listing(text):
-            return "\n".join(f"    {line}" for line in text.splitlines())
-        case Picture():
-            caption = _escaped(block.caption)
-            return f"![{_escaped(block.alt)}](<{folder}/{block.name}.png>)\n\n*{caption}*"
-        case TextTable():
-            return _table(block)
+def _file(name: str) -> str:
+    return (files("dahl_ident.reporting") / name).read_text(encoding="utf-8")
 
 
-def _table(table: TextTable) -> str:
-    lines = [" | ".join(map(_escaped, table.header)), " | ".join("---" for _ in table.header)]
-    lines += [" | ".join(map(_cell, row)) for row in table.rows]
-    return f"**{_escaped(table.caption)}**\n\n" + "\n".join(f"| {line} |" for line in lines)
-
-
-def _cell(cell: Cell) -> str:
-    return f"~~{_escaped(cell.text)}~~" if cell.struck else _escaped(cell.text)
-
-
-def _escaped(text: str) -> str:
-    """Return text with all markup characters escaped."""
-    return re.sub(r"([\\`*_{}\[\]<>|#~$])", r"\\\1", " ".join(text.split()))
+def _escaped(text: object) -> str:
+    """Return text with all markup characters escaped, but what a template calls safe."""
+    if hasattr(text, "__html__"):
+        return str(text)
+    return re.sub(r"([\\`*_{}\[\]<>|#~$])", r"\\\1", " ".join(str(text).split()))
