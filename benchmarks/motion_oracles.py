@@ -184,6 +184,10 @@ class PowerDamperByHand:
         smooth = (ratio * ratio + 1e-12) ** (0.5 * (self.exponent - 1.0))
         return float(self.coefficient * ratio * smooth)
 
+    def functions(self, x: float, v: float, s: float, z: Numbers) -> list[float]:
+        """Return the switching functions."""
+        return []
+
 
 def dahl_branch(z: float, path: float, alpha: float) -> float:
     """Return 1 - s F/limit, z before, after a path of dF/dx = sigma z^alpha, in limit/sigma."""
@@ -268,7 +272,7 @@ class Oracle:
         x, v, z = self.parts(t, y)
         result, i = [v], 0
         for law in self.laws:
-            result += law.functions(x, v, s, z[i : i + law.n]) if law.switches else []
+            result += law.functions(x, v, s, z[i : i + law.n])
             i += law.n
         return np.array(result)
 

@@ -8,6 +8,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.errors import DataWarning
 from tests import cold_records as cold
+from tests.recovery import assert_near
 
 
 def assert_found(case):
@@ -15,12 +16,7 @@ def assert_found(case):
     fit = di.fit(case.record, case.model, throw=False)
     assert fit.success, fit.verdict
     assert fit.status.usable, fit.verdict
-    for parameter in case.truth.parameters:
-        found = fit.params[parameter.name]
-        if found.vary:
-            value, u = float(parameter.value or 0.0), found.stderr
-            assert abs(found.value - value) < 3.0 * u, (parameter.name, found.value, u)
-            assert u < 0.3 * abs(value), (parameter.name, found.value, u)
+    assert_near(fit, case.truth, 3.0, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -114,9 +110,7 @@ def test_an_own_law_at_any_scale_whatever_the_order_of_its_parameters(scale):
     force += 1e-3 * np.random.default_rng(3).standard_normal(t.size)
     fit = di.fit(di.Record(t, displacement=x, force=force), StiffnessFirst())
     assert fit.trusted, fit.verdict
-    for name, value in (("k", 30.0 / scale), ("limit", 0.1)):
-        found = fit.params[name]
-        assert abs(found.value - value) < 4.0 * found.stderr
+    assert_near(fit, (("k", 30.0 / scale), ("limit", 0.1)), 4.0)
 
 
 def with_gap(record, low, high):
@@ -174,11 +168,7 @@ def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers():
     assert fit.trusted
     assert [part.n for part in fit.data] == [400, 1300]
     assert "a single run" in fit.verdict
-    for parameter in case.truth.parameters:
-        found = fit.params[parameter.name]
-        if found.vary:
-            u = found.stderr
-            assert abs(found.value - float(parameter.value or 0.0)) < 3.0 * u
+    assert_near(fit, case.truth, 3.0)
     again = di.FitResult.from_json(fit.to_json())
     assert again.verdict == fit.verdict
 
