@@ -45,9 +45,10 @@ SUMS: dict[str, Element] = {
     "plant": Dahl(0.5, 30.0) + Mass(0.3) + Damper(0.24) + Spring(7.0),
     "two frictions": Dahl(0.5, 30.0, name="a") + Dahl(0.2, 40.0, 2.0, name="b") + Spring(1.0),
 }
-WITH_FORCE: dict[str, Element] = {**FRICTION, **LINEAR, **SUMS}
 EVERY: dict[str, Element] = {
-    **WITH_FORCE,
+    **FRICTION,
+    **LINEAR,
+    **SUMS,
     "transfer function": LinearSystem(mode(0.3, 0.24, 7.0), quantity="receptance"),
     "function": base(),
     "plant with function": Dahl(0.5, 30.0) + base(),
@@ -240,24 +241,6 @@ def test_no_element_gives_energy(element):
     Z = element.dynamic_stiffness(A, OMEGA)
     assert np.all(Z.imag >= -1e-14 * np.abs(Z))
     assert np.max(Z.imag) > 0.0 or type(element) in (Mass, Spring)
-
-
-@pytest.mark.parametrize("element", WITH_FORCE.values(), ids=WITH_FORCE.keys())
-@pytest.mark.parametrize("A", [0.03, 0.5])
-def test_force_over_time_has_the_harmonics_of_the_describing_function(element, A):
-    omega, samples, cycles = 3.0, 2**14, 12
-    theta = 2.0 * np.pi * np.arange(samples * cycles) / samples
-    force = element.force(
-        A * np.cos(theta),
-        velocity=-A * omega * np.sin(theta),
-        acceleration=-A * omega**2 * np.cos(theta),
-    )
-    spectrum = 2.0 / samples * np.fft.rfft(force[-samples:]) / A
-    size = abs(element.dynamic_stiffness(A, omega))
-    assert abs(spectrum[0]) < 1e-7 * size
-    for k in (1, 2, 3, 5, 7):
-        expected = element.dynamic_stiffness(A, omega, harmonic=k)
-        assert abs(spectrum[k] - expected) < 1e-7 * size
 
 
 # bookkeeping
