@@ -36,6 +36,13 @@ class Runner:
         code = ended.value.code
         return Outcome(code if isinstance(code, int) else 0, out, err)
 
+    def refused(self, *arguments: object, stdin: str = "") -> str:
+        """Return the error, of one line, of a command that ends with 1 and prints nothing else."""
+        outcome = self(*arguments, stdin=stdin)
+        assert (outcome.status, outcome.out, outcome.err.count("\n")) == (1, "", 1), outcome
+        assert outcome.err.startswith("error: ")
+        return outcome.err
+
     def line(self, command: str, *extra: str, stdin: str = "") -> Outcome:
         """Run a line of commands joined by pipes; `extra` options go to the last one."""
         stages = command.split(" | ")

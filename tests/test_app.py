@@ -208,9 +208,7 @@ def test_work_is_found_again_and_laws_of_the_user_are_run_only_where_they_were_n
 
 
 def test_a_folder_that_is_not_there_is_named(run):
-    ended = run("app", "none")
-    assert ended.status == 1
-    assert "none is not a folder" in ended.err
+    assert "none is not a folder" in run.refused("app", "none")
 
 
 @pytest.fixture(scope="module")

@@ -57,14 +57,32 @@ def test_command_line_and_python_give_the_same_numbers(run):
         (("sample", "-", "--prior", "f_max"), "prior is 'f_max'; expected a name and two bounds"),
         (("fit", "."), "error: . is a folder; give the path of a file in it"),
         (("fit", "-", "--config", "absent.toml"), "absent.toml is not a TOML file of options"),
+        (("fit", "-", "--save", "fit.txt"), "fit.txt: a fit is written as .json; got '.txt'"),
+        (("fit", "-", "--report", "r.docx"), "r.docx: a report is written as .html, .pdf"),
+        (("sample", "-", "--report", "r"), "r: a report is written as"),
+        (("report", "-", "-o", "-", "--json"), "more than one output goes to standard output"),
+        (("report", "-", "-o", "-", "-o", "-"), "more than one output goes to standard output"),
+        (("fit", "-", "--start", "f_max=much"), "start of f_max is 'much'; expected a number"),
+        (("fit", "-", "--delay", "soon"), "delay is 'soon'; expected a number"),
+        (("fit", "-", "--force-gain", "nrm(1,2)"), "expected a distribution of scipy.stats"),
+        (("fit", "-", "--force-gain", "norm(1,a)"), "which are not arguments of norm"),
+        (
+            ("fit", "-", "--force-gain", "norm(1)"),
+            "leaves out the scale; expected norm(loc, scale)",
+        ),
+        (
+            ("sample", "-", "--prior", "sigma=lognorm(0.1)"),
+            "leaves out the scale; expected lognorm(s, loc, scale)",
+        ),
+        (("fit", "-", "--force-gain", "norm(1,0)"), "has no finite mean or no width"),
+        (("report", "-", "--bootstrap", "--seed", "-2"), "error: seed is -2; expected a whole num"),
+        (("simulate", "--f-max", "1", "--sigma", "3", "--seed", "-1"), "error: seed is -1; expec"),
+        (("report", "-", "-o", "a.doc"), "a.doc: a report is written as"),
     ],
 )
-def test_bad_input_says_what_was_expected(run, arguments, message):
-    outcome = run(*arguments, stdin=NOISY)
-    assert outcome.status == 1
-    assert outcome.err.startswith("error: ")
-    assert outcome.err.count("\n") == 1
-    assert message in outcome.err
+def test_bad_input_says_what_was_expected_and_writes_nothing(run, arguments, message):
+    assert message in run.refused(*arguments, stdin=NOISY)
+    assert list(Path().iterdir()) == []
 
 
 def test_a_fit_that_runs_away_ends_with_3_and_says_why(run):
@@ -112,10 +130,8 @@ def test_options_come_from_a_file_and_the_command_line_wins(run):
 )
 def test_an_unknown_name_in_a_file_of_options_is_refused(run, options, says):
     Path("lab.toml").write_text(options, encoding="utf-8")
-    outcome = run("fit", "x.csv", "--config", "lab.toml")
-    assert outcome.status == 1
-    assert outcome.err.startswith(f"error: lab.toml: {says}")
-    assert outcome.err.count("\n") == 1
+    error = run.refused("fit", "x.csv", "--config", "lab.toml")
+    assert error.startswith(f"error: lab.toml: {says}")
 
 
 def test_a_report_shows_how_waveforms_settled(run):
@@ -128,13 +144,9 @@ def test_a_report_shows_how_waveforms_settled(run):
         encoding="utf-8"
     )
     Path("columns.toml").write_text("[time]\ncolumn = 'clock'\n", encoding="utf-8")
-    wrong = run(
-        "report", "levels.csv", *plant, "--waveforms", "run.csv",
-        "--waveforms-columns", "columns.toml",
-        "-o", "b.html",
-    )  # fmt: skip
-    assert wrong.status == 1
-    assert "no column is called 'clock'" in wrong.err
+    wrong = run.refused("report", "levels.csv", *plant, "--waveforms", "run.csv",
+                        "--waveforms-columns", "columns.toml", "-o", "b.html")  # fmt: skip
+    assert "no column is called 'clock'" in wrong
     assert not Path("b.html").exists()
 
 
@@ -198,9 +210,7 @@ def test_a_proposed_column_map_is_written_and_read(run):
         "Freq (Hz),Disp [um],Gain [N/um],Phase [deg]\n"
         "2,20,0.038,9.7\n2,200,0.011,59\n2,900,0.003,75\n"
     )
-    refused = run("fit", "own.csv")
-    assert refused.status == 1
-    assert "(inspect proposes a column map)" in refused.err
+    assert "(inspect proposes a column map)" in run.refused("fit", "own.csv")
     assert run("inspect", "own.csv", "-o", "columns.toml").status == 0
     assert run("inspect", "own.csv", "-o", "columns.toml").status == 1, "nothing is overwritten"
     assert run("fit", "own.csv", "--columns", "columns.toml").status in (0, 3)
@@ -220,9 +230,8 @@ def test_extraction_of_several_files_names_levels_and_files(run):
     levels = [line.split()[0] for line in told.out.splitlines() if "good" in line]
     assert levels == ["0.002", "0.008"]
     Path("flat.csv").write_text("time [s],x [m],F [N]\n0,1,2\n1,1,2\n2,1,2\n")
-    refused = run("extract", *files, "flat.csv")
-    assert refused.status == 1
-    assert "flat.csv: no segment of constant amplitude" in refused.err
+    refused = run.refused("extract", *files, "flat.csv")
+    assert "flat.csv: no segment of constant amplitude" in refused
 
 
 def test_no_good_point_is_an_error_of_its_own(run):
@@ -253,9 +262,8 @@ def test_sample_integrates_at_once_where_asked(run):
     assert text.status == 0
     assert text.out.startswith("Converged: error ")
     assert "ln evidence: " in text.out
-    refused = run(*options, "--method", "grid", "--max-steps", "30", stdin=NOISY)
-    assert refused.status == 1
-    assert "--max-steps is given together with --method grid, which runs no" in refused.err
+    refused = run.refused(*options, "--method", "grid", "--max-steps", "30", stdin=NOISY)
+    assert "--max-steps is given together with --method grid, which runs no" in refused
 
 
 def test_a_chain_that_is_too_short_ends_with_3(run):
@@ -276,7 +284,6 @@ def test_report_writes_every_format_asked_for(run):
     outcome = run("report", "-", "-o", "a.html", "-o", "a.json", stdin=NOISY)
     assert outcome.out.split() == ["a.html", "a.json"]
     assert json.loads(Path("a.json").read_text(encoding="utf-8"))["trusted"] is True
-    assert run("report", "-", "-o", "a.doc", stdin=NOISY).status == 1
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -429,12 +436,6 @@ def test_a_closed_standard_input_is_named(monkeypatch):
         di.read_frequency_response("-")
 
 
-def test_a_bootstrap_from_a_negative_seed_is_refused(run):
-    outcome = run("report", "-", "--bootstrap", "--seed", "-2", stdin=NOISY)
-    assert outcome.status == 1
-    assert outcome.err == "error: seed is -2; expected a whole number >= 0\n"
-
-
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
@@ -505,11 +506,6 @@ def test_lists_keep_to_a_narrow_terminal(run, monkeypatch):
     assert max(map(len, run("datasets").out.splitlines())) <= 60
 
 
-def test_an_experiment_is_printed_as_toml(run):
-    told = run("simulate", "--f-max", "0.1", "--sigma", "30").out
-    assert Experiment.from_toml(told).truth["sigma"] == 30.0
-
-
 WRITING = {
     "datasets": ("noisy", "-o", "there.csv"),
     "simulate": ("--f-max", "0.1", "--sigma", "30", "-o", "there.csv"),
@@ -527,10 +523,9 @@ def test_what_is_there_is_replaced_on_request_only(run, command):
         word for word in WRITING[command] if word.startswith("there")
     )
     Path(there).write_text("mine", encoding="utf-8")
-    outcome = run(command, *WRITING[command])
-    assert (outcome.status, outcome.out) == (1, "")
-    assert f"error: {there}: the file exists already" in outcome.err
-    assert "--overwrite" in outcome.err
+    error = run.refused(command, *WRITING[command])
+    assert error.startswith(f"error: {there}: the file exists already")
+    assert "--overwrite" in error
     assert [p.name for p in Path().iterdir()] == [there]
     assert Path(there).read_text(encoding="utf-8") == "mine"
 
@@ -549,40 +544,9 @@ def test_overwrite_replaces(run):
 def test_an_input_is_never_written_over(run, option):
     assert run("datasets", "noisy", "-o", "noisy.csv").status == 0
     before = Path("noisy.csv").read_bytes()
-    outcome = run("fit", "noisy.csv", option, "./noisy.csv")
-    assert outcome.status == 1
-    assert "noisy.csv is an input and would be overwritten" in outcome.err
+    refused = run.refused("fit", "noisy.csv", option, "./noisy.csv")
+    assert "noisy.csv is an input and would be overwritten" in refused
     assert Path("noisy.csv").read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("fit", "-", "--save", "fit.txt"), "fit.txt: a fit is written as .json; got '.txt'"),
-        (("fit", "-", "--report", "r.docx"), "r.docx: a report is written as .html, .pdf"),
-        (("sample", "-", "--report", "r"), "r: a report is written as"),
-        (("report", "-", "-o", "-", "--json"), "more than one output goes to standard output"),
-        (("report", "-", "-o", "-", "-o", "-"), "more than one output goes to standard output"),
-        (("fit", "-", "--start", "f_max=much"), "start of f_max is 'much'; expected a number"),
-        (("fit", "-", "--delay", "soon"), "delay is 'soon'; expected a number"),
-        (("fit", "-", "--force-gain", "nrm(1,2)"), "expected a distribution of scipy.stats"),
-        (("fit", "-", "--force-gain", "norm(1,a)"), "which are not arguments of norm"),
-        (
-            ("fit", "-", "--force-gain", "norm(1)"),
-            "leaves out the scale; expected norm(loc, scale)",
-        ),
-        (
-            ("sample", "-", "--prior", "sigma=lognorm(0.1)"),
-            "leaves out the scale; expected lognorm(s, loc, scale)",
-        ),
-        (("fit", "-", "--force-gain", "norm(1,0)"), "has no finite mean or no width"),
-    ],
-)
-def test_bad_options_are_refused_before_anything_is_written(run, arguments, message):
-    outcome = run(*arguments, stdin=NOISY)
-    assert (outcome.status, outcome.out) == (1, "")
-    assert message in outcome.err
-    assert list(Path().iterdir()) == []
 
 
 def test_a_report_goes_to_standard_output(run):
@@ -623,9 +587,8 @@ def test_priors_come_from_a_calibration_sheet(run):
 
 def test_a_saved_fit_takes_no_other_model(run):
     assert run("fit", "-", "--save", "fit.json", stdin=NOISY).status == 0
-    outcome = run("report", "fit.json", "--mass", "free", "-o", "r.html")
-    assert outcome.status == 1
-    assert "saved fits are reported unchanged" in outcome.err
+    refused = run.refused("report", "fit.json", "--mass", "free", "-o", "r.html")
+    assert "saved fits are reported unchanged" in refused
 
 
 def test_a_comparison_is_printed_once(run):

@@ -37,98 +37,76 @@ def odd_columns(tmp_path):
 
 
 @pytest.fixture
-def told(run):
-    """Return what runs a command, and returns its status and what it printed."""
-
-    def call(*words, stdin=""):
-        done = run(*words, stdin=stdin)
-        return done.status, done.out, done.err
-
-    return call
+def mapped(odd_columns):
+    """Return the words that read that file."""
+    return (odd_columns, "--record", "--columns", odd_columns.with_name("columns.toml"))
 
 
-def test_a_column_map_is_used(odd_columns, told):
-    words = ("fit", odd_columns, "--record")
-    code, _, why = told(*words)
-    assert code == 1
-    assert "Name it with --force ..." in why
-    mapped = (*words, "--columns", odd_columns.with_name("columns.toml"))
-    code, out, _ = told(*mapped)
-    assert code == 0
-    assert "f_max" in out
-    (line,) = (line for line in out.splitlines() if line.split()[:1] == ["sigma"])
+def test_a_column_map_is_used(odd_columns, mapped, run):
+    assert "Name it with --force ..." in run.refused("fit", odd_columns, "--record")
+    done = run("fit", *mapped)
+    assert done.status == 0
+    assert "f_max" in done.out
+    (line,) = (line for line in done.out.splitlines() if line.split()[:1] == ["sigma"])
     assert float(line.split()[1]) == pytest.approx(30.0, rel=0.01)
-    assert "Uncertainty budget" not in out
-    code, out, _ = told(*mapped, "-v")
+    assert "Uncertainty budget" not in done.out
+    out = run("fit", *mapped, "-v").out
     assert "Uncertainty budget" in out
     assert "offset" in out
 
 
-def test_waveforms_need_no_option(tmp_path, told):
+def test_waveforms_need_no_option(tmp_path, run):
     for seed in (1, 2):
         recorded(DAHL, "random", 600, 1e-3, seed).save(tmp_path / f"sweep{seed}.csv")
     pattern = tmp_path / "sweep*.csv"
-    code, out, why = told("fit", pattern)
-    assert code == 0
-    assert "the files hold waveforms: fitted sample by sample, as with --record" in why
-    assert out == told("fit", pattern, "--record")[1]
-    code, _, why = told("fit", "-", stdin=(tmp_path / "sweep1.csv").read_text())
-    assert code == 1
-    assert "fitted as a record: dahl-ident fit --record" in why
+    done = run("fit", pattern)
+    assert done.status == 0
+    assert "the files hold waveforms: fitted sample by sample, as with --record" in done.err
+    assert done.out == run("fit", pattern, "--record").out
+    refused = run.refused("fit", "-", stdin=(tmp_path / "sweep1.csv").read_text())
+    assert "fitted as a record: dahl-ident fit --record" in refused
 
 
-def test_a_fast_sweep_is_told_how_to_be_fitted(tmp_path, told):
+def test_a_fast_sweep_is_told_how_to_be_fitted(tmp_path, run):
     t = np.arange(12_000) / 1000.0
     x = 0.02 * np.exp(-t / 6.0) * np.sin(2.0 * np.pi * 5.0 * t)
     path = di.Record(t, displacement=x, force=DAHL.force(x)).save(tmp_path / "a run.csv")
-    words = ("extract", path, "--time", "time [s]")
-    code, out, why = told(*words)
-    assert code == 3
-    assert "biased by about" in " ".join(out.split())
-    assert f"dahl-ident fit --record '{path}' --time 'time [s]'" in why
+    done = run("extract", path, "--time", "time [s]")
+    assert done.status == 3
+    assert "biased by about" in " ".join(done.out.split())
+    assert f"dahl-ident fit --record '{path}' --time 'time [s]'" in done.err
 
 
 @pytest.mark.parametrize("command", ["fit", "sample"])
 @pytest.mark.parametrize("words", [("--level", "1"), ("--noise", "relative")])
-def test_options_of_tables_are_refused(command, words, odd_columns, told):
-    place = odd_columns.with_name("columns.toml")
-    code, _, why = told(command, odd_columns, "--record", "--columns", place, *words)
-    assert code == 1
-    assert re.search(rf"{words[0]} (is )?given (together )?with .*record", why)
+def test_options_of_tables_are_refused(command, words, mapped, run):
+    refused = run.refused(command, *mapped, *words)
+    assert re.search(rf"{words[0]} (is )?given (together )?with .*record", refused)
 
 
-def test_a_gain_without_a_prior_about_one_is_refused(odd_columns, told):
-    place = odd_columns.with_name("columns.toml")
-    command = ("fit", odd_columns, "--record", "--columns", place, "--force-gain", "norm(1.1,0.1)")
-    code, _, why = told(*command)
-    assert code == 1
-    assert "--force-gain is a prior about 1.1;" in why
-    assert "such as 'norm(1, 0.005)', which" in why
+def test_a_gain_without_a_prior_about_one_is_refused(mapped, run):
+    refused = run.refused("fit", *mapped, "--force-gain", "norm(1.1,0.1)")
+    assert "--force-gain is a prior about 1.1;" in refused
+    assert "such as 'norm(1, 0.005)', which" in refused
 
 
-def test_the_force_is_predicted_although_the_model_has_a_mass(odd_columns, told):
-    place = odd_columns.with_name("columns.toml")
-    words = ("fit", odd_columns, "--record", "--columns", place, "--mass", "free")
-    _, out, _ = told(*words, "--predicted", "force")
-    assert "of the measured force" in out
-    code, _, why = told("fit", odd_columns, "--predicted", "force")
-    assert code == 1
-    assert "--record" in why
+def test_the_force_is_predicted_although_the_model_has_a_mass(odd_columns, mapped, run):
+    told = run("fit", *mapped, "--mass", "free", "--predicted", "force").out
+    assert "of the measured force" in told
+    refused = run("fit", odd_columns, "--predicted", "force")
+    assert (refused.status, "--record" in refused.err) == (1, True)
 
 
 @pytest.mark.parametrize("words", [("--loss", "huber"), ("--method", "scipy")])
-def test_losses_and_methods_are_taken_with_records(words, odd_columns, told):
-    place = odd_columns.with_name("columns.toml")
-    base = ("fit", odd_columns, "--record", "--columns", place, "--json")
-    plain, other = (json.loads(told(*base, *more)[1])["params"] for more in ((), words))
+def test_losses_and_methods_are_taken_with_records(words, mapped, run):
+    base = ("fit", *mapped, "--json")
+    plain, other = (json.loads(run(*base, *more).out)["params"] for more in ((), words))
     for name in ("f_max", "sigma"):
         assert other[name]["value"] == pytest.approx(plain[name]["value"], rel=0.01)
 
 
-def test_models_of_records_are_compared(odd_columns, told):
-    place = odd_columns.with_name("columns.toml")
-    words = ("fit", odd_columns, "--record", "--columns", place, "--compare")
-    _, out, _ = told(*words)
+def test_models_of_records_are_compared(mapped, run):
+    out = run("fit", *mapped, "--compare").out
     assert "No model compared is better" in out
     assert "of the force left" in out
 
@@ -171,18 +149,18 @@ def test_two_days_of_waveforms_are_compared(run):
     assert "Changes from each measurement" in Path("r.html").read_text(encoding="utf-8")
 
 
-def test_waveforms_are_read_alike_by_every_command(tmp_path, told):
+def test_waveforms_are_read_alike_by_every_command(tmp_path, run):
     recorded(DAHL, "random", 600, 1e-3).save(tmp_path / "run.csv")
     file, note = tmp_path / "run.csv", "the files hold waveforms: fitted sample by sample"
-    code, _, why = told("fit", file, "--predicted", "force")
-    assert (code, note in why) == (0, True)
-    code, out, why = told("sample", file, "--steps", 20, "--max-steps", 20)
-    assert (code, note in why) == (3, True)
-    assert "f_max" in out
     page = tmp_path / "page.md"
-    code, _, why = told("report", file, "-o", page)
-    assert (code, note in why) == (0, True)
+    for status, words in (
+        (0, ("fit", file, "--predicted", "force")),
+        (3, ("sample", file, "--steps", 20, "--max-steps", 20)),
+        (0, ("report", file, "-o", page)),
+    ):
+        done = run(*words)
+        assert (done.status, note in done.err) == (status, True)
     assert "sigma" in page.read_text()
-    code, _, why = told("fit", file, "--levels", 1)
-    assert code == 1
-    assert "--levels is given together with records of waveforms" in why
+    refused = run("fit", file, "--levels", 1)
+    assert refused.status == 1
+    assert "--levels is given together with records of waveforms" in refused.err
