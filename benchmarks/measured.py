@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -26,24 +25,20 @@ _CYCLES = 3  # at the full amplitude, in the middle of every record
 _STROKE, _FAST = 0.5, 0.5  # of the largest displacement and speed: mid-stroke
 _SMALLEST = 1e-3  # asymmetry that counts as a unit of the search
 # An acceleration's amplitude with a displacement's phase, as the file's own README says.
-BEAM = """
-quantity = "receptance"
-[frequency]
-column = "FRdata.*[*].frequency"
-unit = "Hz"
-[drive]
-column = "FRdata.*[*].force"
-unit = "N"
-[amplitude]
-column = "FRdata.*[*].amplitude"
-unit = "m/s^2"
-[phase]
-column = "FRdata.*[*].phase"
-unit = "rad"
-[controlled]
-force = "ForceControl*"
-displacement = "ResponseControl*"
-"""
+_BEAM_UNITS = {"frequency": "Hz", "force": "N", "amplitude": "m/s^2", "phase": "rad"}
+
+
+def beam_table() -> di.FrequencyResponse:
+    """Return the Brake-Reuss beam near its first mode."""
+    columns = {
+        "drive" if name == "force" else name: {"column": f"FRdata.*[*].{name}", "unit": unit}
+        for name, unit in _BEAM_UNITS.items()
+    }
+    controlled = {"force": "ForceControl*", "displacement": "ResponseControl*"}
+    return di.read_frequency_response(
+        FOLDER / "brb" / "ForcedFrequencyResponses.mat", quantity="receptance",
+        columns={**columns, "controlled": controlled},
+    )  # fmt: skip
 
 
 def middle(record: di.Record, hz: float) -> slice:
@@ -116,12 +111,7 @@ def damper() -> None:
 
 def beam() -> None:
     """Print the misfit of laws with a mode to the bolted beam, and the least of any Masing law."""
-    with tempfile.TemporaryDirectory() as folder:
-        columns = Path(folder) / "columns.toml"
-        columns.write_text(BEAM)
-        table = di.read_frequency_response(
-            FOLDER / "brb" / "ForcedFrequencyResponses.mat", columns=columns
-        )
+    table = beam_table()
     print("\n| levels | rows | any Masing law | Iwan | Dahl |\n|---|---|---|---|---|")
     for kind in ("Force", "Response"):
         data = table.select(level=[level for level in table.levels if level.startswith(kind)])

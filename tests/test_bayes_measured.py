@@ -1,26 +1,17 @@
 """Posteriors from measurements made by others; what the model cannot say has to show."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import dahl_ident as di
-from benchmarks.measured import BEAM
-from tests.test_extraction_measured import FILES, measured
+from benchmarks.measured import beam_table
+from tests.measured import dampers, needs_measured
 
-MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
-pytestmark = pytest.mark.skipif(
-    MEASURED is None,
-    reason="DAHL_IDENT_MEASURED_DATA does not name the folder of the measured data",
-)
+pytestmark = needs_measured
 
 
 def test_the_damper_shows_its_misfit():
-    data = di.FrequencyResponse.concatenate(
-        [di.extract(measured(name), harmonics=(1,)) for name in FILES]
-    )
+    data = di.FrequencyResponse.concatenate([di.extract(r, harmonics=(1,)) for r in dampers()])
     posterior = di.posterior(data, di.Dahl(), seed=1, ess=300.0, uncertainty="noise")
     assert posterior.converged
     size = next(check for check in posterior.checks if check.statistic == "size")
@@ -35,11 +26,8 @@ def test_the_damper_shows_its_misfit():
 
 
 @pytest.mark.long
-def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path):
-    columns = tmp_path / "columns.toml"
-    columns.write_text(BEAM)
-    path = Path(MEASURED or "") / "brb" / "ForcedFrequencyResponses.mat"
-    beam = di.read_frequency_response(path, columns=columns)
+def test_the_bolted_joint_leaves_f_max_to_its_prior():
+    beam = beam_table()
     held = beam.select(level=[label for label in beam.levels if "Response" in str(label)])
     data = held.select(rows=np.arange(held.n) % 8 == 0)
     model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()

@@ -1,16 +1,15 @@
 """The whole chain, from waveforms to a report: on the shipped recording, and on measured data."""
 
 import json
-import os
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 import dahl_ident as di
+from benchmarks.measured import FOLDER
 from dahl_ident.cli import main
-
-MEASURED = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent")) / "brfd"
+from tests.measured import needs_measured
 
 
 def run(*arguments):
@@ -65,11 +64,11 @@ def test_demo_says_where_no_folder_can_be(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err == "error: there: the folder cannot be made: File exists\n"
 
 
-@pytest.mark.skipif(not MEASURED.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no brfd folder")
+@needs_measured
 def test_measured_damper_from_files_to_report(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     tests = ("0.25Hz_0.5in", "0.25Hz_1in", "0.5Hz_0.5in", "0.5Hz_1in", "1Hz_1.5in", "2Hz_0.5in")
-    files = [str(MEASURED / f"band30lb_{test}.csv") for test in tests]
+    files = [str(FOLDER / "brfd" / f"band30lb_{test}.csv") for test in tests]
     assert run("inspect", files[0]) == 0
     contents = capsys.readouterr().out
     assert "1024 Hz" in contents

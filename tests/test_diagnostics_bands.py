@@ -12,7 +12,7 @@ from dahl_ident import extract, fit, load_dataset
 from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.errors import ModelError, ValidationError
 from tests.friction_tables import F_MAX, X_C, amplitudes, plant_table, table
-from tests.test_extraction_measured import crank, needs_data
+from tests.measured import cranks, needs_measured
 
 GRID = np.geomspace(0.05, 20.0, 15) * X_C
 
@@ -127,10 +127,10 @@ class TestBands:
 class TestMeasured:
     """Each test of a damper is predicted by a fit to the others."""
 
-    @needs_data
+    @needs_measured
     def test_bands_hold_what_was_left_out(self):
         data = di.FrequencyResponse.concatenate(
-            [extract(crank(f".A.{i}"), harmonics=[1]) for i in range(1, 11)]
+            [extract(record, harmonics=[1]) for record in cranks(".A.*")]
         )
         model = di.Dahl() + di.Spring() + di.Damper()
         assert "The extraction flagged every point" in fit(data, model).verdict

@@ -1,31 +1,25 @@
 """Two measured joints that no Dahl model describes: what the verdicts say of them."""
 
 import functools
-import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import dahl_ident as di
-from benchmarks.measured import BEAM
-from dahl_ident import extract, fit, read_frequency_response, read_record
+from benchmarks.measured import beam_table
+from dahl_ident import extract, fit
 from dahl_ident.diagnostics import Verdict
 from dahl_ident.diagnostics.slip_density import slip_density
+from tests.measured import assert_still, dampers, needs_measured
 
-FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no folder of measured data"
-)
+pytestmark = needs_measured
 
 
 @pytest.fixture(scope="module")
 def tests():
     """Ten steady levels of the banded rotary friction damper at 30 lbf, harmonics 1 and 3."""
-    files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
-    records = [read_record(f, displacement="displacement", force="friction force") for f in files]
-    return [extract(r, harmonics=[1, 3]) for r in records]
+    return [extract(r, harmonics=[1, 3]) for r in dampers()]
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +30,8 @@ def damper(tests):
 
 
 @pytest.fixture(scope="module")
-def beam(tmp_path_factory):
-    """The Brake-Reuss beam near its first mode."""
-    columns = tmp_path_factory.mktemp("lab") / "columns.toml"
-    columns.write_text(BEAM)
-    return read_frequency_response(FOLDER / "brb/ForcedFrequencyResponses.mat", columns=columns)
+def beam():
+    return beam_table()
 
 
 class TestDamper:
@@ -73,14 +64,7 @@ class TestDamper:
     @pytest.mark.long
     def test_runs_deviate_within_the_bounds_of_parameters(self):
         """A power damper that does not improve the fit, its exponent at zero."""
-        files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
-        every = [
-            extract(
-                read_record(f, displacement="displacement", force="friction force"),
-                harmonics=[1, 3, 5, 7, 9],
-            )
-            for f in files
-        ]
+        every = [extract(r, harmonics=[1, 3, 5, 7, 9]) for r in dampers()]
         found = fit(
             di.FrequencyResponse.concatenate(every), di.Dahl() + di.PowerDamper(), throw=False
         )
@@ -97,14 +81,7 @@ class TestStill:
 
     @pytest.mark.parametrize("harmonics", [pytest.param(1, marks=pytest.mark.long), 3])
     def test_when_a_test_is_left_out(self, tests, harmonics):
-        whole = self.of(tests, harmonics)
-        others = [self.of([*tests[:i], *tests[i + 1 :]], harmonics) for i in range(len(tests))]
-        for name in ("f_max", "sigma"):
-            value, u = whole.params[name].value, whole.params[name].stderr
-            estimates = np.array([found.params[name].value for found in others])
-            assert np.abs(estimates - value).max() < 3.0 * u
-            jackknife = float(np.sqrt((len(tests) - 1) * np.var(estimates)))
-            assert 0.5 * jackknife < u < 3.0 * jackknife
+        assert_still(tests, lambda some: self.of(some, harmonics), ("f_max", "sigma"))
 
     def test_when_harmonics_are_added(self, tests):
         fundamentals, both = self.of(tests, 1), self.of(tests, 3)

@@ -1,38 +1,16 @@
 """Measured hysteresis loops of a rotary friction damper; three steady cycles in each file."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
-from scipy.io import loadmat
 
-from dahl_ident.data import Record
 from dahl_ident.extraction import extract
 from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
+from tests.measured import cranks, dampers, needs_measured
 
-MEASURED = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent")) / "brfd"
-INCH, KIP = 0.0254, 4448.2216152605
+pytestmark = needs_measured
 STEADY_MM = {"0.5in": 12.8, "1in": 25.5, "1.5in": 38.3}
 DISTORTED = "1Hz_1.5in"
 FILES = [*(f"{f}Hz_{a}in" for f in ("0.25", "0.5", "1") for a in ("0.5", "1", "1.5")), "2Hz_0.5in"]
-needs_data = pytest.mark.skipif(
-    not MEASURED.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no brfd folder"
-)
-
-
-def measured(name):
-    columns = np.loadtxt(
-        MEASURED / f"band30lb_{name}.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2)
-    )
-    return Record(columns[:, 0], displacement=INCH * columns[:, 1], force=KIP * columns[:, 2])
-
-
-def crank(name):
-    content = loadmat(MEASURED.parent / "mr_damper" / f"ensaio{name}.mat")
-    x, _, force = content["x_F"].T
-    time = np.arange(x.size) * content["Ts"].item()
-    return Record(time, displacement=1e-3 * x, force=force)
 
 
 def level(samples, per_cycle):
@@ -67,10 +45,9 @@ def loop_area(x, force):
     return float(0.5 * np.sum(force * (np.roll(x, -1) - np.roll(x, 1))))
 
 
-@needs_data
 @pytest.mark.parametrize("name", FILES)
 def test_every_file_gives_its_amplitude_and_loop_area(name):
-    record = measured(name)
+    (record,) = dampers(name)
     every = extract(record, harmonics=range(10))
     assert every.harmonic.tolist() == list(range(10))
     data = every.select(harmonic=1)
@@ -105,24 +82,21 @@ def test_every_file_gives_its_amplitude_and_loop_area(name):
         assert fundamental == pytest.approx(area, rel=0.02)
 
 
-@needs_data
 def test_covariance_is_said_to_be_spectral_and_is_small():
-    data = extract(measured("0.25Hz_1in"), harmonics=[1, 3, 5])
+    data = extract(*dampers("0.25Hz_1in"), harmonics=[1, 3, 5])
     assert set(data.quality["covariance_from"]) == {"spectrum"}
     std = np.sqrt(0.5 * np.trace(data.covariance[0]))
     assert 1e-4 < std / abs(data.response[0]) < 0.02
     assert (data.quality["displacement_steps"] > 1000).all()
 
 
-@needs_data
 def test_asymmetry_beyond_noise_adds_rows_and_is_said():
     with pytest.warns(UserWarning, match=r"the force is asymmetric in 1 of 1 points: even har"):
-        data = extract(measured("1Hz_1in"))
+        data = extract(*dampers("1Hz_1in"))
     assert data.harmonic.tolist() == list(range(10))
     assert 0.05 < data.quality["asymmetry"][0] < 0.15
 
 
-@needs_data
 @pytest.mark.parametrize(
     ("names", "points"), [(("2.1", "8.1"), 5), (("1.1", "10.1"), 3), ((".A.1", ".A.2", ".A.6"), 4)]
 )
@@ -133,7 +107,7 @@ def test_an_unsteady_crank_gives_points_with_the_scatter_of_its_cycles(names, po
     """
     ratios, by_distortion, found = [], [], 0
     for name in names:
-        record = crank(name)
+        (record,) = cranks(name)
         data = extract(record, harmonics=range(4))
         for row in np.flatnonzero(data.harmonic == 1).tolist():
             found += 1
@@ -155,13 +129,9 @@ def test_an_unsteady_crank_gives_points_with_the_scatter_of_its_cycles(names, po
     np.testing.assert_allclose(by_distortion, 1.0, atol=0.1)
 
 
-@needs_data
 def test_every_file_of_the_crank_gives_points_that_cover_most_of_its_motion():
-    names = [
-        *(f"{i}.1" for i in range(1, 11)),
-        *(f".A.{i}" for i in range(1, 11)),
-        *(f".vali.{i}" for i in range(1, 10)),
-    ]
-    for name in names:
-        data = extract(crank(name), harmonics=[1])
-        assert np.sum(data.quality["num_periods"] / data.frequency_hz) > 0.5 * 12.0, name
+    records = [record for series in ("[0-9]*.1", ".A.*", ".vali.*") for record in cranks(series)]
+    assert len(records) == 29
+    for record in records:
+        data = extract(record, harmonics=[1])
+        assert np.sum(data.quality["num_periods"] / data.frequency_hz) > 0.5 * 12.0

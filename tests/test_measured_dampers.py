@@ -1,12 +1,9 @@
 """Measured dampers: what laws beyond Dahl find in whole records, from no guess."""
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
 
 from dahl_ident import (
     Backlash,
@@ -15,17 +12,13 @@ from dahl_ident import (
     FrequencyResponse,
     Mass,
     PowerDamper,
-    Record,
     Spring,
     extract,
     fit,
-    read_record,
 )
+from tests.measured import assert_still, cranks, dampers, needs_measured
 
-FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no folder of measured data"
-)
+pytestmark = needs_measured
 
 
 def estimated(records, model):
@@ -38,43 +31,24 @@ def estimated(records, model):
 
 def test_a_friction_damper_with_a_gap():
     """Three whole tests at 0.5 Hz: stiffness as others found it; the gap exceeds 3 mm."""
-    records = [
-        read_record(f, displacement="displacement", force="friction force")
-        for f in sorted((FOLDER / "brfd").glob("band30lb_0.5Hz_*.csv"))
-    ]
+    records = dampers("0.5Hz_*")
     values, share = estimated(records, Backlash(Dahl(asymmetry=None)) + Mass() + Damper())
     assert share < 0.18
     assert values["sigma"] == pytest.approx(4.6e6, rel=0.1)
     assert 3.0e-3 < values["gap"] < 4.5e-3
 
 
-def cranked(pattern, step=2):
-    """Return a series of the magneto-rheological damper, every second record."""
-    records = []
-    for file in sorted((FOLDER / "mr_damper").glob(pattern))[::step]:
-        content = loadmat(file)
-        columns, interval = content["x_F"], float(content["Ts"].squeeze())
-        records.append(
-            Record(
-                interval * np.arange(len(columns)),
-                displacement=1e-3 * columns[:, 0],
-                force=columns[:, 2],
-            )
-        )
-    return records
-
-
 @pytest.mark.parametrize(
     ("pattern", "most"),
     [
-        pytest.param("ensaio[0-9]*.1.mat", 0.14, marks=pytest.mark.long),
-        pytest.param("ensaio.A.*.mat", 0.12, marks=pytest.mark.long),
-        ("ensaio.vali.*", 0.07),
+        pytest.param("[0-9]*.1", 0.14, marks=pytest.mark.long),
+        pytest.param(".A.*", 0.12, marks=pytest.mark.long),
+        (".vali.*", 0.07),
     ],
 )
 def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
     model = Dahl() + PowerDamper() + Spring() + Mass()
-    values, share = estimated(cranked(pattern), model)
+    values, share = estimated(cranks(pattern)[::2], model)
     assert share < most
     assert 0.1 < values["exponent"] < 1.2
 
@@ -83,38 +57,27 @@ def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
     ("pattern", "labelled", "names"),
     [
         # two minima of the exponent, 1.1 and 2.5: the likelier counts, its distance is in u
-        ("ensaio[0-9]*.1.mat", False, ("f_max", "sigma", "alpha", "damping")),
-        pytest.param(
-            "ensaio.A.*.mat", False, ("f_max", "sigma", "alpha", "damping"), marks=pytest.mark.long
-        ),
+        ("[0-9]*.1", False, ("f_max", "sigma", "alpha", "damping")),
+        pytest.param(".A.*", False, ("f_max", "sigma", "alpha", "damping"), marks=pytest.mark.long),
         # the test of two rows holds most of what tells friction from damping
-        pytest.param(
-            "ensaio.vali.*.mat", True, ("f_max", "sigma", "damping"), marks=pytest.mark.long
-        ),
+        pytest.param(".vali.*", True, ("f_max", "sigma", "damping"), marks=pytest.mark.long),
     ],
 )
 def test_no_test_left_out_lets_an_estimate_jump(pattern, labelled, names):
-    tests = [extract(record, harmonics=[1]) for record in cranked(pattern, 1)]
+    tests = [extract(record, harmonics=[1]) for record in cranks(pattern)]
     if labelled:
         tests = [replace(t, level=np.full(t.n, f"test {i}")) for i, t in enumerate(tests)]
 
     def estimate(some):
         data = FrequencyResponse.concatenate(some)
-        return fit(data, Dahl() + Damper(), throw=False).params
+        return fit(data, Dahl() + Damper(), throw=False)
 
-    whole = estimate(tests)
-    others = [estimate([*tests[:i], *tests[i + 1 :]]) for i in range(len(tests))]
-    for name in names:
-        value, u = whole[name].value, whole[name].stderr
-        estimates = np.array([each[name].value for each in others])
-        assert np.abs(estimates - value).max() < 3.0 * u
-        jackknife = float(np.sqrt((len(tests) - 1) * np.var(estimates)))
-        assert 0.5 * jackknife < u < 3.0 * jackknife
+    assert_still(tests, estimate, names)
 
 
 def test_a_runaway_start_does_not_win():
     """Without its sixth test, one start of this series runs to a stiffness of 7e17 N/m."""
-    records = [r for i, r in enumerate(cranked("ensaio[0-9]*.1.mat", 1)) if i != 6]
+    records = [r for i, r in enumerate(cranks("[0-9]*.1")) if i != 6]
     tests = FrequencyResponse.concatenate([extract(r, harmonics=[1]) for r in records])
     params = fit(tests, Dahl() + Spring(), throw=False).params
     assert params["f_max"].value == pytest.approx(89.3, rel=0.02)

@@ -1,31 +1,23 @@
 """Measurements made by others, read as their laboratories left them."""
 
-import os
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 from scipy.io import loadmat
 
-from benchmarks.measured import BEAM
+from benchmarks.measured import FOLDER, beam_table
 from dahl_ident.data import inspect, read_frequency_response, read_record
+from tests.measured import dampers, needs_measured
 
-MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
-pytestmark = pytest.mark.skipif(
-    MEASURED is None,
-    reason="DAHL_IDENT_MEASURED_DATA does not name the folder of the measured data",
-)
-FOLDER = Path(MEASURED or "")
+pytestmark = needs_measured
 FILES = sorted((FOLDER / "brfd").glob("*.csv"))
 
 
 @pytest.fixture(scope="module")
-def beam(tmp_path_factory):
-    columns = tmp_path_factory.mktemp("lab") / "brb.toml"
-    columns.write_text(BEAM)
-    return read_frequency_response(FOLDER / "brb" / "ForcedFrequencyResponses.mat", columns=columns)
+def beam():
+    return beam_table()
 
 
 class TestBrakeReussBeam:
@@ -97,15 +89,11 @@ class TestFrictionDamper:
         ]
 
     def test_there_are_ten(self):
-        assert len(list((FOLDER / "brfd").glob("*.csv"))) == 10
+        assert len(FILES) == 10
 
     def test_the_damper_dissipates(self):
         """Work over a whole test is positive, in joules that kip and inch alone would not give."""
-        record = read_record(
-            FOLDER / "brfd" / "band30lb_0.5Hz_1in.csv",
-            displacement="displacement",
-            force="friction force",
-        )
+        (record,) = dampers("0.5Hz_1in")
         work = float(trapezoid(record.force_samples, record.displacement))
         assert 1e3 < work < 1e5
 
