@@ -174,24 +174,34 @@ def _tdms(x: Any, f: Any) -> bytes:
     return buffer.getvalue()
 
 
-def _uff(t: Any, x: Any, f: Any) -> bytes:
+def uff_function(data: Any, x: Any, kind: int, numerator: int, **changes: Any) -> dict[str, Any]:
+    """Return one data set 58 for pyuff."""
+    return {
+        "type": 58, "func_type": kind, "rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3,
+        "data": data, "x": x, "id1": "test", "rsp_ent_name": "rig", "ref_ent_name": "rig",
+        "abscissa_spacing": 1, "abscissa_spec_data_type": 18 if kind == 4 else 17,
+        "ordinate_spec_data_type": numerator,
+        "orddenom_spec_data_type": 13 if kind == 4 else 0, **changes,
+    }  # fmt: skip
+
+
+def write_uff(path: Path, *sets: dict[str, Any]) -> Path:
+    """Write a universal file."""
     pyuff: Any = importlib.import_module("pyuff")
-    sets = [
-        {
-            "type": 58, "func_type": 1, "rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3,
-            "data": values, "x": t, "id1": "test", "rsp_ent_name": "rig",
-            "ref_ent_name": "rig", "abscissa_spacing": 1, "abscissa_spec_data_type": 17,
-            "ordinate_spec_data_type": kind, "orddenom_spec_data_type": 0,
-            "ordinate_axis_units_lab": unit,
-        }
-        for values, kind, unit in ((x, 8, "m"), (f, 13, "N"))
-    ]  # fmt: skip
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
-        path = Path(folder) / "run.uff"
-        pyuff.UFF(str(path)).write_sets(sets, mode="overwrite")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # pyuff leaves files open
+        pyuff.UFF(str(path)).write_sets(list(sets), mode="overwrite")
         gc.collect()
-        return path.read_bytes()
+    return path
+
+
+def _uff(t: Any, x: Any, f: Any) -> bytes:
+    sets = [
+        uff_function(values, t, 1, kind, ordinate_axis_units_lab=unit)
+        for values, kind, unit in ((x, 8, "m"), (f, 13, "N"))
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        return write_uff(Path(folder) / "run.uff", *sets).read_bytes()
 
 
 def _hdf5(named: dict[str, Any], options: dict[str, Any]) -> bytes:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from dahl_ident import Dahl
+from dahl_ident import Dahl, Model
 from dahl_ident.errors import ModelError, ValidationError
 
 ALPHAS = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -55,6 +55,16 @@ def test_at_rest_friction_is_a_spring(alpha):
     assert friction.dissipated_energy(0.0) == 0.0
     assert [float(c) for c in friction.fourier_coefficients(0.0)] == [0.0, 0.0]
     assert friction.dynamic_stiffness(0.0, harmonic=3) == 0.0
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("k", [2, 4, 14, 100])
+def test_even_harmonics_are_exactly_zero(alpha, k):
+    model = Model(Dahl(0.5, 30.0, alpha)).with_free(["f_max", "sigma", "alpha"])
+    A = np.array([0.0, 1e-12, 0.01, 1e3])
+    found = model.stiffness_gradient(model.known_values(), A, np.zeros(()), k)
+    for part in (found.value, found.by_amplitude, *found.by_parameter):
+        np.testing.assert_array_equal(part, np.zeros(4))
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
@@ -119,7 +129,9 @@ def test_scalars_stay_scalars_and_shapes_stay(call, alpha):
     grid = call(friction, [[0.01, 0.02], [0.0, 3.0]])
     assert isinstance(grid, np.ndarray)
     assert grid.shape == (2, 2)
+    many = call(friction, np.append(np.geomspace(1e-4, 10.0, 500), 0.01))
     assert grid[0, 0] == pytest.approx(one, rel=1e-14)
+    assert many[-1] == pytest.approx(one, rel=1e-13)
     assert call(friction, []).shape == (0,)
 
 

@@ -114,36 +114,3 @@ def test_slips_like_a_square_wave_at_large_amplitudes():
         for k in ODD:
             c = harmonic(at(1e60), at(alpha), k)
             assert complex(c) == pytest.approx(4j / (np.pi * k), rel=1e-10)
-
-
-def test_broadcasts_and_does_not_depend_on_company():
-    beta, alpha = np.geomspace(1e-3, 1e3, 500), np.array([[0.5], [1.0], [2.5]])
-    together = stiffness(beta, alpha, 1, 2)
-    for part in together:
-        assert part.shape == (3, 500)
-    alone = stiffness(beta[123:124], alpha[2], 1, 2)
-    for part, one in zip(together, alone, strict=True):
-        assert part[2, 123] == pytest.approx(complex(one[0]), rel=1e-13)
-    assert stiffness(np.zeros((0, 2)), at(2.0))[0].shape == (0, 2)
-
-
-def test_no_amplitude_is_a_spring():
-    h, by_ln_f_max, by_ln_sigma, by_alpha = stiffness(
-        np.array([0.0, 1e-250]), np.array([[0.3], [1.0], [3.0]]), 1, 2
-    )
-    assert np.all(h == 1.0)
-    assert np.all(by_ln_f_max == 0.0)
-    assert np.all(by_ln_sigma == 1.0)
-    assert np.all(by_alpha == 0.0)
-    for k in ODD:
-        for c in harmonic_gradient(at(0.0), at(2.0), k):
-            assert complex(c) == 0.0
-    assert turning_force(at(0.0), at(2.0)) == 0.0
-
-
-@pytest.mark.parametrize("k", [2, 4, 14])
-def test_even_harmonics_vanish(k):
-    beta, alpha = np.array([0.0, 1.0, 1e6]), np.array([[0.5], [2.0]])
-    assert harmonic(beta, alpha, k).shape == (2, 3)
-    for part in harmonic_gradient(beta, alpha, k):
-        assert np.all(part == 0.0)

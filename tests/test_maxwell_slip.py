@@ -11,6 +11,7 @@ import dahl_ident as di
 from dahl_ident import fit
 from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.errors import DataError, ModelError, ValidationError
+from tests.recovery import assert_near
 from tests.test_generic_friction import Jenkins
 
 SLIPS, STIFF = np.array([0.1, 0.3, 1.0]), np.array([3.0, 2.0, 1.0])
@@ -91,9 +92,7 @@ def table(law, *, noise=0.0, seed=1):
 
 def test_stiffnesses_are_estimated_at_given_and_at_free_slips():
     found = fit(table(LAW, noise=0.003), di.MaxwellSlip(SLIPS))
-    for name, true in zip(("stiffness_1", "stiffness_2", "stiffness_3"), STIFF, strict=True):
-        estimate = found.params[name]
-        assert abs(estimate.value - true) < 4.0 * estimate.stderr < 0.2
+    assert_near(found, LAW, 4.0, 0.016)
     two = di.MaxwellSlip([0.1, 1.0], [3.0, 1.0])
     exchanged = {"slip_1": 1.0, "slip_2": 0.1, "stiffness_1": 1.0, "stiffness_2": 3.0}
     for start in (None, exchanged):  # slips rise, wherever the search began

@@ -21,6 +21,12 @@ TIGHT = with_covariance(friction_table(30, 0.1, 10.0, 0.01), 0.01)  # f_max to 0
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 
+def grid_of(data, model=None, **options):
+    """Return the posterior by points, of independent noise alone."""
+    model = di.Dahl() if model is None else model
+    return di.posterior(data, model, method="grid", uncertainty="noise", **options)
+
+
 def box(dims, low, high):
     parameters = [Parameter(f"p{i}", "", "a number") for i in range(dims)]
     return JointPrior(tuple(ParameterPrior(p, (low, high)) for p in parameters))
@@ -62,9 +68,7 @@ def test_a_wall_cuts_the_density():
 def test_one_parameter_against_scipy():
     data = friction_table(rows=5, noise=0.3)
     prior = (0.01, 1.0)
-    grid = di.posterior(
-        data, di.Dahl(sigma=30.0), priors={"f_max": prior}, method="grid", uncertainty="noise"
-    )
+    grid = grid_of(data, di.Dahl(sigma=30.0), priors={"f_max": prior})
     problem = TableProblem(data, di.Dahl(sigma=30.0))
 
     def density(theta, moment=0):
@@ -113,7 +117,7 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed):
     low, noise = 10.0 ** random.uniform([-2.0, -1.2], [1.5, 0.0])
     data = friction_table(int(random.integers(2, 6)), low, 30.0 * low, noise, seed)
     priors = {"f_max": (1e-3, 10.0), "sigma": (0.3, 3e3)}
-    grid = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
+    grid = grid_of(data, priors=priors)
     assert grid.error < 1e-3
     _, mass = brute_force(grid, priors, 90)
     assert abs(mass.sum() - 1.0) < grid.error
@@ -123,7 +127,7 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed):
 def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows):
     priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
     data = friction_table(rows, noise=0.1)
-    grid = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
+    grid = grid_of(data, priors=priors)
     nodes, mass = brute_force(grid, priors, 40)
     theta, mass = nodes.reshape(-1, 2), mass.ravel() / mass.sum()
     y = np.log(data.response / TableProblem(data, di.Dahl()).predict(theta))
@@ -162,7 +166,7 @@ def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows):
     ids=["peak", "heavy tails", "open to the wall", "microslip", "spring cut by walls"],
 )  # fmt: skip
 def test_the_stated_error_holds_against_brute_force(data, model, priors, panels):
-    grid = di.posterior(data, model, priors=priors, method="grid", uncertainty="noise")
+    grid = grid_of(data, model, priors=priors)
     assert grid.error < 1e-3
     nodes, mass = brute_force(grid, priors, panels)
     assert abs(mass.sum() - 1.0) < grid.error
@@ -194,7 +198,7 @@ def test_a_second_mode_is_found_from_the_prior():
 def test_a_bolted_ridge_keeps_its_time():
     # what once took millions of points: f_max open to its wall with a free spring
     data = spring_table(1e-3, 20, 0.003, 0.03)
-    grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
+    grid = grid_of(data, di.Dahl() + di.Spring())
     assert grid.converged, grid.message
     assert grid.evaluations < 300_000
     rule_ = grid.prior_influences[0]
@@ -204,7 +208,7 @@ def test_a_bolted_ridge_keeps_its_time():
 def test_friction_that_may_be_none_at_either_end():
     # sigma alone shows; with a free spring friction may as well be none
     data = di.load_dataset("microslip")
-    grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
+    grid = grid_of(data, di.Dahl() + di.Spring())
     assert grid.converged
     # the product of Gauss's rule, 240 nodes in ln f_max and in ln sigma, with the trapezoidal rule
     # along the spring around its conditional mode
@@ -212,19 +216,14 @@ def test_friction_that_may_be_none_at_either_end():
 
 
 def test_an_accuracy_that_is_not_reached_is_said():
-    grid = di.posterior(
-        friction_table(), di.Dahl(), method="grid", uncertainty="noise", tolerance=1e-6
-    )
+    grid = grid_of(friction_table(), tolerance=1e-6)
     assert not grid.converged
     assert grid.message.startswith("NOT CONVERGED: error")
     assert grid.evaluations < 300_000
 
 
 def test_the_same_answer_at_every_call():
-    first, second = (
-        di.posterior(TIGHT, di.Dahl(), method="grid", uncertainty="noise", tolerance=1e-2)
-        for _ in range(2)
-    )
+    first, second = (grid_of(TIGHT, tolerance=1e-2) for _ in range(2))
     assert first.log_evidence == second.log_evidence
     np.testing.assert_array_equal(first.points[1], second.points[1])
 
@@ -232,25 +231,14 @@ def test_the_same_answer_at_every_call():
 def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one():
     data = friction_table(rows=8, noise=0.05)
     priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
-    plain = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
-    wider = di.posterior(
-        data,
-        di.Dahl(),
-        priors={**priors, "alpha": (0.3, 3.0)},
-        free=["alpha"],
-        method="grid",
-        uncertainty="noise",
-        tolerance=1e-2,
-    )
+    plain = grid_of(data, priors=priors)
+    wider = grid_of(data, priors={**priors, "alpha": (0.3, 3.0)}, free=["alpha"], tolerance=1e-2)
     assert wider.log_evidence < plain.log_evidence
 
 
 def test_scale_free_and_scale_known_agree_for_many_rows():
     table = friction_table(rows=200, noise=0.02)
-    free, known = (
-        di.posterior(data, di.Dahl(), method="grid", uncertainty="noise", tolerance=5e-3)
-        for data in (table, with_covariance(table, 0.02))
-    )
+    free, known = (grid_of(data, tolerance=5e-3) for data in (table, with_covariance(table, 0.02)))
     assert known.names == ("f_max", "sigma")
     # the scale is known to 5 % from 400 residuals
     assert known.std()[:2] == pytest.approx(free.std()[:2], rel=0.15)
@@ -258,9 +246,7 @@ def test_scale_free_and_scale_known_agree_for_many_rows():
 
 
 def test_a_microslip_posterior_names_the_prior():
-    grid = di.posterior(
-        friction_table(10, 0.0003, 0.003, 0.05), di.Dahl(), method="grid", uncertainty="noise"
-    )
+    grid = grid_of(friction_table(10, 0.0003, 0.003, 0.05))
     (rule_,) = grid.prior_influences
     assert str(rule_).startswith("f_max is known from its prior: posterior width 0.")
     assert rule_.at_upper_end
@@ -278,9 +264,7 @@ def test_a_microslip_posterior_names_the_prior():
     ],
 )
 def test_data_outweigh_the_tail_of_a_prior(prior):
-    grid = di.posterior(
-        TIGHT, di.Dahl(), priors={"f_max": prior}, method="grid", uncertainty="noise"
-    )
+    grid = grid_of(TIGHT, priors={"f_max": prior})
     # the likelihood of f_max, sigma profiled out, is nearly normal over its value
     optimum = di.fit(TIGHT, di.Dahl()).optimum
     f, std = optimum.values[0], np.sqrt(optimum.values_covariance[0, 0])
@@ -295,19 +279,17 @@ def test_data_outweigh_the_tail_of_a_prior(prior):
 
 
 def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit():
-    walled = di.posterior(
-        TIGHT, di.Dahl(), priors={"f_max": (1.0, 2.0)}, method="grid", uncertainty="noise"
-    )
+    walled = grid_of(TIGHT, priors={"f_max": (1.0, 2.0)})
     assert "at the lower end; check the prior, its unit" in str(walled)
     assert "MISFIT: the residuals are larger than the noise that the data state" in str(walled)
     assert [f.code for f in walled.findings[:2]] == ["prior_influence", "predictive_check"]
-    free = di.posterior(TIGHT, di.Dahl(), method="grid", uncertainty="noise")
+    free = grid_of(TIGHT)
     assert free.trusted
     assert "Noise alone is counted; with every source" in free.verdict
 
 
 def test_marginals_are_densities_with_the_right_quantiles():
-    grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
+    grid = grid_of(friction_table())
     for name in grid.names:
         ends = grid.quantile(name, np.array([1e-5, 0.3, 1.0 - 1e-5]))
         x = np.linspace(ends[0], ends[2], 4001)
@@ -322,7 +304,7 @@ def test_marginals_are_densities_with_the_right_quantiles():
 
 
 def test_expectation_and_draws():
-    grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
+    grid = grid_of(friction_table())
     x_c = grid.function(lambda f_max, sigma: f_max / sigma)["mean"]
     assert x_c == pytest.approx(X_C, rel=0.05)
     draws = grid.draws(4000, seed=1)
@@ -333,7 +315,7 @@ def test_expectation_and_draws():
 
 @pytest.mark.parametrize("bad", [0.0, 1.0, 1.5, np.nan])
 def test_quantiles_of_what_is_no_probability_are_refused(bad):
-    grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
+    grid = grid_of(friction_table())
     for name in grid.names:
         with pytest.raises(ValidationError, match=r"probabilities\[1\] is .*; expected"):
             grid.quantile(name, [0.5, bad])
@@ -343,15 +325,15 @@ def test_refusals():
     data = friction_table()
     plant = di.Dahl() + di.Spring() + di.Damper()
     with pytest.raises(SamplingError, match=r"4 parameters are free \(f_max, sigma, stiffness"):
-        di.posterior(data, plant, method="grid", uncertainty="noise")
+        grid_of(data, plant)
     with pytest.raises(ModelError, match="there is no 'mass'; expected one of f_max, sigma"):
-        di.posterior(data, di.Dahl(), method="grid", uncertainty="noise").quantile("mass", 0.5)
+        grid_of(data).quantile("mass", 0.5)
     with pytest.raises(ValidationError, match="unknown noise scale has no closed integral"):
         di.posterior(data, di.Dahl(), likelihood="student_t", method="grid")
     exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
     perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
     with pytest.raises(SamplingError, match="there is no noise whose scale could be estimated"):
-        di.posterior(perfect, di.Dahl(), method="grid", uncertainty="noise")
+        grid_of(perfect)
     two = friction_table(rows=1)
     with pytest.raises(SamplingError, match="2 residuals cannot determine 2 parameters"):
-        di.posterior(two, di.Dahl(), method="grid", uncertainty="noise")
+        grid_of(two)

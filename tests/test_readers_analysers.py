@@ -1,6 +1,5 @@
 """Files of dynamic signal analysers, made here byte by byte from their manuals."""
 
-import importlib
 import json
 import struct
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.data import inspect, read_frequency_response
 from dahl_ident.errors import DataError, DataWarning, UnitError
+from tests.reader_fuzz import uff_function, write_uff
 
 FREQUENCY = np.geomspace(1.0, 100.0, 21)
 FRICTION = di.Dahl(f_max=0.1, sigma=30.0, alpha=1.0)
@@ -314,18 +314,17 @@ class TestHeaders:
         with pytest.raises(DataError, match="neither an amplitude nor a drive"):
             read_frequency_response(path)
 
+    def universal(self, path, force, **changes):
+        """Write a receptance over uneven frequencies, its units as labels."""
+        labels = {"ordinate_axis_units_lab": "m", "orddenom_axis_units_lab": "N"}
+        function = uff_function(receptance(force), FREQUENCY, 4, 8, ref_node=1, **changes, **labels)
+        return write_uff(path, function | {"abscissa_spacing": 0})
+
     def test_universal_files(self, tmp_path):
-        pyuff: Any = importlib.import_module("pyuff")
-        paths: list[Path] = []
-        for force in LEVELS:
-            paths.append(tmp_path / f"frf {len(paths)}.uff")
-            pyuff.UFF(str(paths[-1])).write_sets([{
-                "type": 58, "binary": 0, "func_type": 4, "rsp_node": 1, "rsp_dir": 3,
-                "ref_node": 1, "ref_dir": 3, "data": receptance(force), "x": FREQUENCY,
-                "id1": "pivot", "id2": f"Excitation level {force} N", "abscissa_spacing": 0,
-                "ordinate_axis_units_lab": "m", "orddenom_axis_units_lab": "N",
-                "orddenom_spec_data_type": 13, "ordinate_spec_data_type": 8,
-            }])  # fmt: skip
+        paths = [
+            self.universal(tmp_path / f"frf {i}.uff", force, id2=f"Excitation level {force} N")
+            for i, force in enumerate(LEVELS)
+        ]
         data = read_frequency_response(paths)
         assert data.run is None
         assert data.levels == ["0.05 N", "0.2 N", "0.6 N"]
@@ -338,15 +337,7 @@ class TestHeaders:
         lambda b: b"    -1\n  1858\n 1 2 3\nfree text\n    -1\n" + b,
     ])  # fmt: skip
     def test_universal_files_of_others(self, change, tmp_path):
-        pyuff: Any = importlib.import_module("pyuff")
-        path = tmp_path / "frf.unv"
-        pyuff.UFF(str(path)).write_sets([{
-            "type": 58, "binary": 0, "func_type": 4, "rsp_node": 1, "rsp_dir": 3,
-            "ref_node": 1, "ref_dir": 3, "data": receptance(0.2), "x": FREQUENCY,
-            "id1": "drive level 0.2 N", "abscissa_spacing": 0,
-            "ordinate_axis_units_lab": "m", "orddenom_axis_units_lab": "N",
-            "orddenom_spec_data_type": 13, "ordinate_spec_data_type": 8,
-        }])  # fmt: skip
+        path = self.universal(tmp_path / "frf.unv", 0.2, id1="drive level 0.2 N")
         path.write_bytes(change(path.read_bytes()))
         data = read_frequency_response(path)
         np.testing.assert_allclose(data.response, receptance(0.2), rtol=1e-5)

@@ -1,12 +1,10 @@
 """Files other than text, each written by the library of its format and read back."""
 
-import gc
 import gzip
 import importlib
 import json
 import re
 import sys
-import warnings
 import zipfile
 from inspect import signature
 from typing import Any
@@ -18,6 +16,7 @@ from scipy.io import savemat
 
 from dahl_ident.data import Record, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, MissingDependencyError, UnitError
+from tests.reader_fuzz import uff_function, write_uff
 
 pytestmark = pytest.mark.versions
 
@@ -331,27 +330,6 @@ class TestHdf5:
             root["data"] = rows
         run = {"time": "data.t [s]", "displacement": "data.x [m]", "force": "data.F [N]"}
         assert_the_run(read_record(tmp_path / "run.h5", columns=run))
-
-
-def uff_function(data, x, kind, numerator, **changes):
-    """One data set 58."""
-    return {
-        "type": 58, "func_type": kind, "rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3,
-        "data": data, "x": x, "id1": "test", "rsp_ent_name": "rig", "ref_ent_name": "rig",
-        "abscissa_spacing": 1, "abscissa_spec_data_type": 18 if kind == 4 else 17,
-        "ordinate_spec_data_type": numerator,
-        "orddenom_spec_data_type": 13 if kind == 4 else 0, **changes,
-    }  # fmt: skip
-
-
-def write_uff(path, *sets):
-    pyuff: Any = importlib.import_module("pyuff")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)  # pyuff leaves binary files open
-        pyuff.UFF(str(path)).write_sets(list(sets), mode="overwrite")
-        if any(one.get("binary") for one in sets):
-            gc.collect()
-    return path
 
 
 SI = {"type": 164, "units_code": 1, "units_description": "SI", "temp_mode": 1,

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import json
-import os
 import pickle
 from pathlib import Path
 
@@ -13,15 +12,16 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
 
 import dahl_ident as di
+from benchmarks.measured import FOLDER
 from dahl_ident.elements import Model
 from dahl_ident.engine import differentiated
 from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
 from dahl_ident.problem import RecordProblem
 from dahl_ident.results import FitResult
+from tests.measured import needs_measured
 from tests.motions import Driven
+from tests.recovery import assert_near
 
-MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
-needs_measured = pytest.mark.skipif(not MEASURED, reason="DAHL_IDENT_MEASURED_DATA is not set")
 RATE = 500.0
 DAHL = di.Dahl(f_max=0.1, sigma=30.0)
 BOUC_WEN = di.BoucWen(sigma=30.0, q=200.0, p=500.0)
@@ -85,8 +85,7 @@ def test_a_driven_acceleration_is_found_without_a_start(kind):
     fit = di.fit(di.Record(t, force=drive, acceleration=a), model)
     assert fit.trusted
     truth = {"f_max": 0.5, "sigma": 2e3, "mass": 0.3, "damping": 0.5, "stiffness": 400.0}
-    for name, value in truth.items():
-        assert fit.params[name].value == pytest.approx(value, abs=3.5 * fit.params[name].stderr)
+    assert_near(fit, truth, 3.5)
 
 
 @pytest.mark.parametrize("kind", ["random", "trapezoid"])
@@ -95,11 +94,7 @@ def test_force_from_displacement(kind):
     truth = DAHL + di.Spring(5.0) + di.Damper(0.3)
     fit = di.fit(recorded(truth, kind, 1500, 1e-3), di.Dahl() + di.Spring() + di.Damper())
     assert fit.trusted, fit.verdict
-    for parameter in truth.parameters:
-        found = fit.params[parameter.name]
-        if found.vary and found.stderr is not None:
-            assert abs(found.value - float(parameter.value or 0)) < 4.5 * found.stderr
-            assert found.stderr < 0.2 * found.value
+    assert_near(fit, truth, 4.5, 0.2)
 
 
 def test_exact_where_there_is_no_noise():
@@ -115,10 +110,7 @@ def test_motion_from_force(channel):
     truth = {"f_max": 0.1, "sigma": 300.0, "mass": 0.3, "damping": 0.5, "stiffness": 50.0}
     fit = di.fit(driven(1, 0.01, channel=channel), model)
     assert fit.trusted, fit.verdict
-    for name, value in truth.items():
-        found = fit.params[name]
-        assert abs(found.value - value) < 4.5 * found.stderr, fit
-        assert found.stderr < 0.2 * value
+    assert_near(fit, truth, 4.5, 0.2)
 
 
 def test_runs_are_fitted_together():
@@ -204,10 +196,7 @@ def test_noise_of_a_smooth_displacement_hardly_matters(kind, noise, treatment):
     assert fit.trusted, fit.verdict
     assert treatment in fit.verdict
     assert fit.problem.is_smoothed
-    for name, value in (("f_max", 0.5), ("sigma", 1e4)):
-        found = fit.params[name]
-        assert found.value == pytest.approx(value, abs=2.0 * found.stderr)
-        assert found.stderr < 0.03 * value
+    assert_near(fit, (("f_max", 0.5), ("sigma", 1e4)), 2.0, 0.03)
     assert FitResult.from_json(fit.to_json()).verdict == fit.verdict
 
 
@@ -228,9 +217,7 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness():
     fit = di.fit(record, di.Dahl() + di.Mass() + di.Damper() + di.Spring(), start=truth)
     assert fit.noise == "spectrum"
     assert fit.trusted, fit.verdict
-    for name, value in truth.items():
-        found = fit.params[name]
-        assert abs(found.value - value) < 4.0 * found.stderr, fit
+    assert_near(fit, truth, 4.0)
     assert fit.params["stiffness"].stderr < 0.6
     assert fit.budget()["mass"].rows[0].source == "noise"
     assert {"noise", "noise in the drive"} <= {r.source for r in fit.budget()["mass"].rows}
@@ -464,7 +451,7 @@ def test_refusals():
 
 @needs_measured
 def test_earthquake_on_friction_isolators():
-    place = Path(str(MEASURED)) / "base_isolation"
+    place = FOLDER / "base_isolation"
     floors = [np.loadtxt(place / f"ICA100_a{i}.txt") for i in range(1, 7)]
     x = np.loadtxt(place / "ICA100_d1.txt")
     n = min(len(x), *map(len, floors))
@@ -564,8 +551,7 @@ def test_a_long_record_is_fitted_by_a_law_that_depends_on_time():
     force += 5e-3 * np.random.default_rng(0).standard_normal(t.size)
     model = di.LuGre(static_ratio=1.0, stribeck_speed=1.0, viscous=None)
     fit = di.fit(di.Record(t, displacement=x, force=force), model)
-    for name, value in (("f_max", 2.5), ("sigma", 4e4), ("viscous", 50.0)):
-        assert fit.params[name].value == pytest.approx(value, abs=3.5 * fit.params[name].stderr)
+    assert_near(fit, (("f_max", 2.5), ("sigma", 4e4), ("viscous", 50.0)), 3.5)
     assert 0.0 < fit.effective_samples < 2.0 * t.size
     with pytest.raises(ValidationError, match="a fit of a table has no effective samples; extract"):
         _ = di.fit(di.load_dataset("noisy"), di.Dahl()).effective_samples

@@ -25,37 +25,36 @@ def fit():
     return di.fit(record(TRUE + NOISE), MODEL)
 
 
-@pytest.mark.parametrize("label", ["offset", "drift", "initial_force"])
-def test_a_parameter_called_as_one_of_the_records_is_refused(label):
+def law_with(label):
+    """Return a law whose friction limit has this name."""
+
     class Own(di.Friction):
         parameters = (
-            di.Parameter("sigma", "N/m", "stiffness", lower=0.0, transform="log"),
+            di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
             di.Parameter(label, "N", "friction limit", lower=0.0, transform="log"),
         )
 
         def slope(self, force, direction, velocity, values):
             return values[0] * (1.0 - direction * force / values[1])
 
-    for model in (Own(), Own(30.0), Own(None, 0.1) + di.Spring()):
+    return Own
+
+
+@pytest.mark.parametrize("label", ["offset", "drift", "initial_force"])
+def test_a_parameter_called_as_one_of_the_records_is_refused(label):
+    own = law_with(label)
+    for model in (own(), own(30.0), own(None, 0.1) + di.Spring()):
         with pytest.raises(ModelError, match=f"{label}, which is also an unknown of a fit of rec"):
             di.fit(record(TRUE + NOISE), model)
 
 
 def test_unknowns_of_two_elements_have_names_of_their_own():
-    class Own(di.Friction):
-        parameters = (
-            di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
-            di.Parameter("limit", "N", "friction limit", lower=0.0, transform="log"),
-        )
-
-        def slope(self, force, direction, velocity, values):
-            return values[0] * (1.0 - direction * force / values[1])
-
+    own = law_with("limit")
     with pytest.raises(
         ModelError, match="unknown called initial_force in a fit of records; give each"
     ):
-        di.fit(record(TRUE + NOISE), MODEL + Own())
-    problem = di.fit(record(TRUE + NOISE), MODEL + Own(3.0, 1e-3, name="own")).problem
+        di.fit(record(TRUE + NOISE), MODEL + own())
+    problem = di.fit(record(TRUE + NOISE), MODEL + own(3.0, 1e-3, name="own")).problem
     assert {"initial_force", "own_initial_force"} < set(problem.names)
 
 
@@ -199,10 +198,16 @@ def test_fits_with_constraints_have_no_budget_and_hold_nothing_out():
         tied = di.fit(
             data, MODEL, method="ipopt", constraints=lambda p: [p["sigma"] == 300.0 * p["f_max"]]
         )
+        ratio = tied.params["sigma"].value / tied.params["f_max"].value
+        assert ratio == pytest.approx(300.0, rel=1e-8)
+        assert tied.stated_budget is None
         for refused in (tied.budget, tied.hold_out):
             with pytest.raises(FitError, match="the fit had constraints"):
                 refused()
         assert tied.fit_report()
+        intervals = tied.conf_interval()
+        assert (intervals.method, "constraints" in intervals.note) == ("wald", True)
+        assert di.FitResult.from_json(tied.to_json()).conf_interval().note == intervals.note
 
 
 def test_what_one_kind_alone_has_is_refused_in_one_way(fit):

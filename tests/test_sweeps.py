@@ -7,6 +7,7 @@ import numpy as np
 
 import dahl_ident as di
 from dahl_ident.synthetic import Acquisition, Channel, Experiment, FrequencySweep, SteppedSine
+from tests.recovery import assert_near
 
 PLANT = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
 MODEL = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
@@ -20,9 +21,7 @@ def sweep(level, seed):
 def assert_true(fit):
     truth = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 0.24, "stiffness": 0.3}
     assert fit.trusted, fit.verdict
-    for name, value in truth.items():
-        found = fit.params[name]
-        assert abs(found.value - value) < 4.0 * found.stderr, fit
+    assert_near(fit, truth, 4.0)
 
 
 def test_the_shipped_sweeps_are_fitted_as_waveforms():
