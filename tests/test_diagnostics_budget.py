@@ -207,8 +207,8 @@ class TestBudget:
         )  # fmt: skip
         found = fit(data, Dahl(alpha=1.0))
         assert found.status == "approximate", found.verdict
-        assert found.goodness.objections == (str(found.goodness.runs_differ),)
-        assert found.goodness.chi_square.p_value > 1e-3
+        assert found.goodness.objections == (str(found.goodness.of("runs differ")[0]),)
+        assert found.goodness.of("chi-square")[0].p_value > 1e-3
         f_max = found.errors.values["f_max"] * np.exp(found.errors.runs.each[:, 0])
         f_max *= np.exp(found.errors.runs.each[:, -2])
         np.testing.assert_allclose(f_max, limits, rtol=1e-3)
@@ -412,7 +412,7 @@ class TestEstimate:
 
     def test_no_misfit_where_the_model_describes_the_data(self):
         data = load_dataset("noisy")
-        assert fit(data, Dahl()).goodness.chi_square is not None
+        assert fit(data, Dahl()).goodness.of("chi-square")
         found = modelled(data, Dahl(alpha=1.0))
         assert not found.estimate.problem.has_misfit
         plain = fit(data, Dahl(alpha=1.0)).optimum

@@ -58,8 +58,8 @@ class TestDamper:
         assert any("over frequency, from 0.25 to 2 Hz" in text for text in found.goodness.details)
         assert "which no rate-independent model can describe" in found.verdict
         linear = fit(data, di.Dahl(alpha=1.0)).goodness
-        (trend,) = (t for t in linear.trends if t.covariate == "frequency")
-        assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
+        (trend,) = (t for t in linear.of("trend") if t.about == "frequency")
+        assert np.expm1(trend.values["stiffness"].value) == pytest.approx(-0.26, abs=0.04)
 
     @pytest.mark.long
     def test_runs_deviate_within_the_bounds_of_parameters(self):

@@ -51,7 +51,8 @@ def test_they_are_fitted_with_the_fundamental():
     fit = fitted()
     assert fit.status.usable, fit.verdict
     assert_near(fit, (("f_max", 0.1), ("sigma", 30.0), ("damping", 0.24), ("stiffness", 0.3)), 4.0)
-    assert fit.goodness.third_harmonic.ratio == pytest.approx(1.0, abs=0.2)
+    (third,) = fit.goodness.of("third harmonic")
+    assert third.values["ratio"] == pytest.approx(1.0, abs=0.2)
     assert fit.plot_residuals() is not None
     assert fit.plot() is not None
 

@@ -513,7 +513,9 @@ def test_a_constraint_that_the_data_contradict_is_said_so(known):
     assert "consistent with noise" not in wrong.verdict
     if known:
         residuals = wrong.optimum.residuals
-        assert wrong.goodness.chi_square.value == pytest.approx(residuals @ residuals, rel=1e-6)
+        assert wrong.goodness.of("chi-square")[0].values["value"] == pytest.approx(
+            residuals @ residuals, rel=1e-6
+        )
     cost = wrong.optimum.constraint_cost
     rise = 2.0 * (wrong.optimum.cost - free.optimum.cost) / free.optimum.scale**2
     assert cost.rise == pytest.approx(rise, rel=1e-6)

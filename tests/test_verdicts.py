@@ -43,14 +43,15 @@ def stiffened(rise, noise=0.01, seed=1):
 
 def rise(data, model=None):
     """Return the rise of stiffness with the amplitude that a fit's goodness holds, or None."""
-    return fit(data, model or Dahl(alpha=1.0) + Spring(), throw=False).goodness.stiffening
+    made = fit(data, model or Dahl(alpha=1.0) + Spring(), throw=False)
+    return next(iter(made.goodness.of("stiffening")), None)
 
 
 class TestStiffening:
     def test_size_and_place_of_a_rise(self):
         found = rise(stiffened(0.2))
-        assert found.rise == pytest.approx(0.17, abs=0.02)
-        assert found.low < 0.02 * X_C < 0.06 * X_C < found.high
+        assert found.values["rise"] == pytest.approx(0.17, abs=0.02)
+        assert found.values["low"] < 0.02 * X_C < 0.06 * X_C < found.values["high"]
         assert found.p_value < 1e-9
 
     def test_the_verdict_says_so(self):
@@ -72,7 +73,7 @@ class TestStiffening:
         A = np.repeat([1e-3, 1e-1], 5) * np.tile(np.geomspace(1.0, 1.05, 5), 2) * X_C
         Z = np.repeat([30.0, 36.0], 5) * (1.0 + 0.01j) * relative_noise(10, 1e-3, 1)
         data = FrequencyResponse(np.ones(10), Z, A)
-        assert rise(data, Dahl(alpha=1.0) + Spring()).rise == pytest.approx(0.2, abs=0.01)
+        assert rise(data, Dahl(alpha=1.0) + Spring()).values["rise"] == pytest.approx(0.2, abs=0.01)
         assert rise(data, Dahl(alpha=1.0) + Spring() + Mass()) is None
 
     def test_it_needs_friction_and_points(self):

@@ -339,8 +339,8 @@ class TableAssessment(Assessment):
     @property
     def chi_square(self) -> tuple[float, int]:
         """Chi-square of the goodness of fit where it applies, else the sum of squares."""
-        known = self.goodness.chi_square
-        return super().chi_square if known is None else (known.value, known.dof)
+        known = [test.values for test in self.goodness.of("chi-square")]
+        return (known[0]["value"], known[0]["dof"]) if known else super().chi_square
 
     @cached_property
     def cross_validation(self) -> CrossValidation | None:

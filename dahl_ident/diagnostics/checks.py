@@ -188,10 +188,11 @@ def _misfit_of_table(fit: TableAssessment) -> Iterator[Finding]:
 
 def _stated_exponent_is_wrong(fit: TableAssessment) -> bool:
     """Return whether the data contradict an exponent that the user gave."""
-    exponent, parameters = fit.goodness.exponent, fit.problem.model.parameters
-    if exponent is None or exponent.p_value > fit.goodness.level:
-        return False
-    return not any(p.assumed for p in parameters if p.name == exponent.name)
+    assumed = {p.name for p in fit.problem.model.parameters if p.assumed}
+    return any(
+        test.p_value <= fit.goodness.level and test.about not in assumed
+        for test in fit.goodness.of("exponent")
+    )
 
 
 def _bands(fit: TableAssessment) -> Iterator[Finding]:
@@ -224,8 +225,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
 @_of_tables
 def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
     """Yield where a force exceeds what friction can carry, except in rows that stand apart."""
-    errors, differ = fit.errors, fit.goodness.runs_differ
-    scatter = 0.0 if differ is None else sum(differ.scatter.values())
+    errors, scatter = fit.errors, sum(fit.goodness.runs_scatter.values())
     optimum = fit.optimum if errors is None else errors.at_estimate
     named = optimum.loss != "linear" or fit.goodness.apart  # as what contradicts the model
     outliers = [p.row for p in fit.goodness.suspicious] if named else []

@@ -46,10 +46,7 @@ from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.trends import (
     LEAST_DOF,
     LEAST_RANGE,
-    GroupsDiffer,
-    Runs,
-    Stiffening,
-    Trend,
+    ResidualTest,
     groups,
     runs,
     stiffening,
@@ -70,106 +67,8 @@ _WORTH_NAMING = 0.1  # share of the largest scatter, below which a scatter is no
 
 
 @dataclass(frozen=True)
-class ChiSquare:
-    """Sum of squared residuals of known variance; `p_value` is the probability by noise alone."""
-
-    value: float
-    dof: int
-    p_value: float
-
-    def __str__(self) -> str:
-        return f"chi-square {self.value:.4g} with {counted(self.dof, 'degree of freedom')}"
-
-
-@dataclass(frozen=True)
-class ThirdHarmonic:
-    """Measured third harmonic of the force over the model's, from the rows of that harmonic.
-
-    `ratio` is the data's over the model's, where 1 is agreement; `p_value` also sees wrong phases.
-    """
-
-    ratio: float
-    stderr: float
-    p_value: float
-
-    def __str__(self) -> str:
-        return f"the third harmonic is {with_unit(self.ratio, self.stderr, '')} times the model's"
-
-
-@dataclass(frozen=True)
-class Exponent:
-    """The exponent that the score test indicates, where the fit holds it fixed."""
-
-    name: str
-    fixed: float
-    indicated: float
-    stderr: float
-    p_value: float
-    widened: float = 1.0
-    """Factor of `stderr`, because the data scatter more than their covariance states."""
-
-    def __str__(self) -> str:
-        value = with_unit(self.indicated, self.stderr, "")
-        widening = ""
-        if self.widened > 1.0:
-            widening = f" (error widened {self.widened:.2g} times because of the misfit)"
-        return f"{self.name} near {value}{widening} describes the data better than {self.fixed:g}"
-
-
-@dataclass(frozen=True)
-class Scatter:
-    """Scatter about the fit over that of the data's own covariance, which the fit left unused."""
-
-    ratio: float
-
-    def __str__(self) -> str:
-        return f"the scatter is {self.ratio:.2g} times what the data's covariance states"
-
-
-@dataclass(frozen=True)
-class RunsDiffer:
-    """Scatter between runs beyond the noise: of ln gain, phase (rad), and ln of parameters."""
-
-    scatter: Mapping[str, float]
-    p_value: float
-
-    def __str__(self) -> str:
-        least = _WORTH_NAMING * max(self.scatter.values())
-        parts = [f"{n} by {_relative(n, s)}" for n, s in self.scatter.items() if s >= least]
-        return f"the runs differ ({', '.join(parts)})"
-
-
-@dataclass(frozen=True)
-class SmoothMisfit:
-    """A departure smooth over amplitude and frequency that exceeds the noise; rms of ln gain."""
-
-    size: float
-    noise: float
-    p_value: float
-
-    def __str__(self) -> str:
-        return (
-            f"the data depart smoothly from the model by {percent(self.size)} rms, more than "
-            f"their noise ({percent(self.noise)})"
-        )
-
-
-_Test = (
-    SmoothMisfit
-    | GroupsDiffer
-    | RunsDiffer
-    | ChiSquare
-    | Stiffening
-    | Trend
-    | Runs
-    | Exponent
-    | ThirdHarmonic
-)
-
-
-@dataclass(frozen=True)
 class Goodness:
-    """Residuals after the fit, and what they mean; a test that does not apply is None, or missing.
+    """Residuals after the fit, and what they mean.
 
     Examples
     --------
@@ -184,20 +83,13 @@ class Goodness:
     rms_misfit: float
     warnings: tuple[str, ...] = ()  # what is impossible or unsafe, and is not a finding
     flagged: tuple[str, ...] = ()  # rows that the extraction flagged, with the reason
-    chi_square: ChiSquare | None = None  # where the noise's scale is known
+    # every test that applies; where the scatter between runs exceeds the noise, those within runs
+    tests: tuple[ResidualTest, ...] = ()
     # estimated noise over the size of the response; None where the noise's scale is known
     noise_share: float | None = None
     dof: int = 0
-    stiffening: Stiffening | None = None  # largest rise of stiffness with amplitude
-    trends: tuple[Trend, ...] = ()  # departure over each covariate that varies
-    runs: tuple[Runs, ...] = ()  # runs of sign over each covariate
-    groups: tuple[GroupsDiffer, ...] = ()  # differences between labels, such as devices
-    exponent: Exponent | None = None  # where one Dahl element has a fixed exponent
-    third_harmonic: ThirdHarmonic | None = None
-    scatter: Scatter | None = None  # where the data have a covariance that is not used
-    smooth: SmoothMisfit | None = None  # where it exceeds the noise
-    # where the scatter between runs exceeds the noise; the other tests are then those within runs
-    runs_differ: RunsDiffer | None = None
+    # scatter about the fit over that of the data's own covariance, where the fit left that unused
+    scatter: float | None = None
     suspicious: tuple[SuspiciousPoint, ...] = ()  # points that stand apart
     # whether the amplitudes give no more numbers than friction has free parameters, so that any
     # law fits
@@ -216,28 +108,16 @@ class Goodness:
     @cached_property
     def level(self) -> float:
         """p-value below which one test counts, by Holm's procedure."""
-        remaining = len(self._tests)
-        for p in sorted(test.p_value for test in self._tests):
+        remaining = len(self.tests)
+        for p in sorted(test.p_value for test in self.tests):
             if remaining == 1 or not p < _FALSE_ALARM / remaining:
                 break
             remaining -= 1
         return _FALSE_ALARM / max(remaining, 1)
 
-    @property
-    def _tests(self) -> list[_Test]:
-        """Every test that applies."""
-        tests = (
-            self.runs_differ,
-            self.chi_square,
-            self.stiffening,
-            *self.groups,
-            *self.trends,
-            *self.runs,
-            self.exponent,
-            self.third_harmonic,
-            self.smooth,
-        )
-        return [test for test in tests if test is not None]
+    def of(self, kind: str) -> list[ResidualTest]:
+        """Return the tests of one kind."""
+        return [test for test in self.tests if test.kind == kind]
 
     @property
     def acceptable(self) -> bool:
@@ -265,40 +145,39 @@ class Goodness:
 
     def _departures(self, level: float) -> Iterator[str]:
         """Yield every departure whose p-value is below `level`, the most informative first."""
-        yield from (str(group) for group in self.groups if group.p_value < level)
-        if self.runs_differ is not None:
-            yield str(self.runs_differ)
-        departing = [trend for trend in self.trends if trend.p_value < level]
-        with_rate = [trend for trend in departing if trend.covariate == "frequency"]
+
+        def clear(kind: str) -> list[ResidualTest]:
+            return [test for test in self.of(kind) if test.p_value < level]
+
+        yield from map(str, (*clear("groups"), *self.of("runs differ")))
+        departing = clear("trend")
+        with_rate = [trend for trend in departing if trend.about == "frequency"]
         yield from (f"{t.brief}, which no rate-independent model can describe" for t in with_rate)
-        if self.stiffening is not None and self.stiffening.p_value < level:
-            yield str(self.stiffening)
+        yield from map(str, clear("stiffening"))
         if self.beyond_any_sensor and self.noise_share is not None:
             yield (
                 f"the scatter is {percent(self.noise_share)} of the response, "
                 "more than any sensor's noise"
             )
         with_level = [trend.brief for trend in departing if trend not in with_rate]
-        if self.exponent is not None:
-            if self.exponent.p_value < level:
-                with_level.append(str(self.exponent))
-            if self.exponent.fixed == 1.0 and with_level:
-                with_level[0] = f"these data are not linear Dahl: {with_level[0]}"
+        with_level += map(str, clear("exponent"))
+        if with_level and any(test.values["fixed"] == 1.0 for test in self.of("exponent")):
+            with_level[0] = f"these data are not linear Dahl: {with_level[0]}"
         yield from with_level
-        if self.smooth is not None and self.smooth.p_value < level and not departing:
-            yield str(self.smooth)
-        for test in (self.third_harmonic, self.chi_square):
-            if test is not None and test.p_value < level:
-                yield str(test)
-        if not departing:
-            yield from (str(test) for test in self.runs if test.p_value < level)
+        yield from map(str, () if departing else clear("smooth"))
+        yield from map(str, (*clear("third harmonic"), *clear("chi-square")))
+        yield from map(str, () if departing else clear("runs"))
+
+    @property
+    def runs_scatter(self) -> Mapping[str, float]:
+        """Scatter between runs beyond the noise: of ln gain, phase (rad), and ln of parameters."""
+        return next((test.values for test in self.of("runs differ")), {})
 
     @property
     def is_of_several_devices(self) -> bool:
         """Whether runs or labelled rows scatter as those of several devices do."""
-        runs = [] if self.runs_differ is None else list(self.runs_differ.scatter.values())
-        groups = [group.scatter for group in self.groups if group.p_value < self.level]
-        return max([*runs, *groups], default=0.0) > _OF_ONE_DEVICE
+        groups = [t.values["scatter"] for t in self.of("groups") if t.p_value < self.level]
+        return max([*self.runs_scatter.values(), *groups], default=0.0) > _OF_ONE_DEVICE
 
     @property
     def law_is_wrong(self) -> bool:
@@ -329,8 +208,8 @@ class Goodness:
         elif self.untested:
             yield described("one_amplitude", _NOT_DETERMINED, **misfit)
         elif not self.objections:
-            far_more = self.scatter is not None and self.scatter.ratio > _FAR_MORE
-            scatter = str(self.scatter) if far_more else ""
+            far_more = self.scatter is not None and self.scatter > _FAR_MORE
+            scatter = self._scatter_in_words if far_more else ""
             yield described("noise", _TRUSTED, **misfit, hints=self.hints, scatter=scatter)
         if self.flagged:
             every = len(self.flagged) == self.fundamentals
@@ -348,6 +227,10 @@ class Goodness:
             yield described("jenkins_bound", worst, least=self.bound, law=law)
 
     @property
+    def _scatter_in_words(self) -> str:
+        return f"the scatter is {self.scatter:.2g} times what the data's covariance states"
+
+    @property
     def cause(self) -> str:
         """The reason why the data are not described, in words; empty where none is known."""
         causes = (f for f in self.findings() if f.code in ("sign", "rows_apart"))
@@ -361,9 +244,9 @@ class Goodness:
     @property
     def details(self) -> list[str]:
         """Every test with its p-value, suspicious points and warnings, a line each."""
-        lines = [f"{test} ({p_text(test.p_value)})" for test in self._tests]
+        lines = [f"{test} ({p_text(test.p_value)})" for test in self.tests]
         if self.scatter is not None:
-            lines.append(str(self.scatter))
+            lines.append(self._scatter_in_words)
         lines += [f"suspicious: {point}" for point in self.suspicious]
         lines += [f"warning: {text}" for text in self.warnings]
         return lines + [f"flagged in extraction: {text}" for text in self.flagged]
@@ -382,7 +265,10 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     if errors is not None and tested.objections:
         within, stated = _within_runs(errors), optimum.problem.data.run is not None
         if within is not None:  # unless runs are stated, labels may explain their differences
-            tested = within if stated else replace(within, groups=tested.groups)
+            if not stated:
+                others = (test for test in within.tests if test.kind != "groups")
+                within = replace(within, tests=(*others, *tested.of("groups")))
+            tested = within
     if optimum.loss != "linear":  # a robust loss hides where the model fails
         tested = replace(tested, neighbours=_side_by_side(optimum, tested))
     if optimum.method == "ipopt" or (optimum.success and not tested.objections):
@@ -391,7 +277,7 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     if sign:
         return replace(tested, sign=sign)
     tested = _without_suspicious(optimum, tested)
-    differ = tested.runs_differ or any(group.p_value < tested.level for group in tested.groups)
+    differ = tested.runs_scatter or any(t.p_value < tested.level for t in tested.of("groups"))
     if differ or not tested.objections:
         return tested  # no law describes several devices at once
     least, misfit = least_misfit(optimum), tested.rms_misfit
@@ -459,7 +345,10 @@ def _within_runs(errors: ErrorModel) -> Goodness | None:
         for source, v in zip(errors.sources, errors.variances.tolist(), strict=True)
         if source.name == RUNS and v > 0.0
     }
-    return replace(tested, runs_differ=RunsDiffer(scatter, p))
+    least = _WORTH_NAMING * max(scatter.values())
+    parts = [f"{n} by {_relative(n, s)}" for n, s in scatter.items() if s >= least]
+    text = f"the runs differ ({', '.join(parts)})"
+    return replace(tested, tests=(ResidualTest("runs differ", p, text, scatter), *tested.tests))
 
 
 def _tested(
@@ -476,21 +365,24 @@ def _tested(
     if errors is not None and errors.estimate.problem.has_misfit:
         weighted = ResidualSpace(optimum, None if within is None else errors.runs, errors.estimate)
     chi_square = _chi_square(optimum, space)
+    tests = (
+        chi_square,
+        stiffening(optimum),
+        *groups(optimum, space),
+        *trends(optimum, weighted),
+        *runs(optimum, space),
+        _exponent(optimum, space, chi_square),
+        _third_harmonic(optimum, space),
+        _smooth(errors) if within is None else None,
+    )
     return Goodness(
         rms_misfit(problem, optimum.theta),
         tuple(physical_warnings(optimum)),
         flagged_rows(problem.data),
-        chi_square,
+        tuple(test for test in tests if test is not None),
         _noise_share(optimum),
         optimum.dof,
-        stiffening(optimum),
-        tuple(trends(optimum, weighted)),
-        tuple(runs(optimum, space)),
-        tuple(groups(optimum, space)),
-        _exponent(optimum, space, chi_square),
-        _third_harmonic(optimum, space),
         _scatter(optimum),
-        _smooth(errors) if within is None else None,
         suspicious=suspicious_points(optimum, space),
         untested=_untested(optimum),
         rows=problem.data.n,
@@ -498,11 +390,16 @@ def _tested(
     )
 
 
-def _smooth(errors: ErrorModel | None) -> SmoothMisfit | None:
+def _smooth(errors: ErrorModel | None) -> ResidualTest | None:
+    """Return the test of a departure that is smooth over amplitude and frequency."""
     if errors is None or errors.structure <= 1.0:
         return None
     size = errors.rms(MODEL_ERROR)
-    return SmoothMisfit(size, size / errors.structure, errors.structure_by_chance)
+    text = (
+        f"the data depart smoothly from the model by {percent(size)} rms, more than their noise "
+        f"({percent(size / errors.structure)})"
+    )
+    return ResidualTest("smooth", errors.structure_by_chance, text, {"size": size})
 
 
 def _relative(name: str, size: float) -> str:
@@ -518,11 +415,13 @@ def _untested(optimum: Optimum) -> bool:
     return np.ptp(np.log(view.amplitude)) < LEAST_RANGE and free >= 2 * len(view.orders)
 
 
-def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
+def _chi_square(optimum: Optimum, space: ResidualSpace) -> ResidualTest | None:
     if not optimum.scale_known or space.dof <= 0:
         return None
     value = float(space.residuals @ space.residuals)
-    return ChiSquare(value, space.dof, float(special.chdtrc(space.dof, value)))
+    text = f"chi-square {value:.4g} with {counted(space.dof, 'degree of freedom')}"
+    p = float(special.chdtrc(space.dof, value))
+    return ResidualTest("chi-square", p, text, {"value": value, "dof": space.dof})
 
 
 def _noise_share(optimum: Optimum) -> float | None:
@@ -542,18 +441,21 @@ def _noise_share(optimum: Optimum) -> float | None:
     return min(optimum.scale, float(np.sqrt(middle / _MEDIAN_SQUARE))) / size
 
 
-def _scatter(optimum: Optimum) -> Scatter | None:
+def _scatter(optimum: Optimum) -> float | None:
     problem = optimum.problem
     if problem.noise == "measured" or problem.data.covariance is None or optimum.dof <= 0:
         return None
     y, _ = problem.like(noise="measured").residuals_and_jacobian(optimum.theta, tails=False)
-    return Scatter(float(np.sqrt(y @ y / optimum.dof)))
+    return float(np.sqrt(y @ y / optimum.dof))
 
 
 def _exponent(
-    optimum: Optimum, space: ResidualSpace, chi_square: ChiSquare | None
-) -> Exponent | None:
-    """Return the score test of the exponent that the only friction law holds fixed."""
+    optimum: Optimum, space: ResidualSpace, chi_square: ResidualTest | None
+) -> ResidualTest | None:
+    """Return the score test of the exponent that the only friction law holds fixed.
+
+    `widened` is the factor of `stderr` where the data scatter more than their covariance states.
+    """
     elements = [e for e in optimum.problem.model.elements if not e.is_linear]
     exponents = [p for e in elements for p in e.parameters if p.is_exponent]
     if len(elements) != 1 or len(exponents) != 1 or optimum.status.at_infinity:
@@ -566,11 +468,18 @@ def _exponent(
     p = space.p_value(change[None])
     if not error < 1.0 or np.isnan(p):  # with a larger error the exponent is unknown
         return None
-    indicated = alpha.value * float(np.exp(slope))
-    widened = 1.0
+    indicated, widened, widening = alpha.value * float(np.exp(slope)), 1.0, ""
     if chi_square is not None and chi_square.p_value < _FALSE_ALARM:
-        widened = (chi_square.value / chi_square.dof) ** 0.5
-    return Exponent(alpha.name, alpha.value, indicated, indicated * error * widened, p, widened)
+        widened = (chi_square.values["value"] / chi_square.values["dof"]) ** 0.5
+    if widened > 1.0:
+        widening = f" (error widened {widened:.2g} times because of the misfit)"
+    u = indicated * error * widened
+    text = (
+        f"{alpha.name} near {with_unit(indicated, u, '')}{widening} describes the data better than "
+        f"{alpha.value:g}"
+    )
+    numbers = {"fixed": alpha.value, "indicated": indicated, "stderr": u, "widened": widened}
+    return ResidualTest("exponent", p, text, numbers, alpha.name)
 
 
 def _change_with_exponent(optimum: Optimum, name: str) -> ComplexArray:
@@ -581,10 +490,16 @@ def _change_with_exponent(optimum: Optimum, name: str) -> ComplexArray:
     return quotient(slope, freed.predict(theta))
 
 
-def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | None:
+def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ResidualTest | None:
+    """Return the third harmonic of the data over the model's, 1 for agreement.
+
+    The p-value also sees wrong phases.
+    """
     rows = optimum.problem.data.harmonic == 3
     if not rows.any():
         return None
     third = rows.astype(np.complex128)
-    ratio, error = space.coefficient(third)
-    return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([third, 1j * third])))
+    excess, error = space.coefficient(third)
+    text = f"the third harmonic is {with_unit(1.0 + excess, error, '')} times the model's"
+    p = space.p_value(np.array([third, 1j * third]))
+    return ResidualTest("third harmonic", p, text, {"ratio": 1.0 + excess})

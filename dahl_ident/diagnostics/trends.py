@@ -16,8 +16,9 @@ are compared. Rows that are predicted by the exact steady motion are not tested.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -47,24 +48,27 @@ _LARGEST_DEPARTURE = 9.0  # the same of a relative departure
 
 
 @dataclass(frozen=True)
-class Stiffening:
-    """The largest rise of stiffness with amplitude that the data show, against its error."""
+class ResidualTest:
+    """What a test of the residuals shows, and the probability that noise alone shows as much."""
 
-    low: float  # amplitudes between which it rises: geometric means over their bands
-    high: float
-    unit: str  # of the amplitudes
-    rise: float  # relative to the stiffness at `low`
-    stderr: float
-    p_value: float  # probability of such a rise by noise alone, over all pairs of bands
+    kind: str
+    p_value: float
+    text: str
+    values: Mapping[str, Any]  # its numbers
+    about: str = ""  # the covariate or column of labels
+    brief: str = ""  # of a trend, the text without its range
 
     def __str__(self) -> str:
-        size = with_unit(100.0 * self.rise, 100.0 * self.stderr, "%")
-        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}"
-        return f"stiffness rises with amplitude, by {size} {ends}, which this law cannot describe"
+        return self.text
 
 
-def stiffening(optimum: Optimum) -> Stiffening | None:
-    """Return the most significant rise of stiffness with amplitude; None where there is none."""
+def stiffening(optimum: Optimum) -> ResidualTest | None:
+    """Return the most significant rise of stiffness with amplitude; None where there is none.
+
+    Its p-value is that of such a rise by noise alone over all pairs of bands. `low` and `high` are
+    the geometric means of the amplitudes in two bands, and `rise` is relative to the stiffness at
+    `low`.
+    """
     elements = optimum.problem.model.elements
     friction = [e for e in elements if not e.is_linear]
     if optimum.is_exact or not friction or not all(e.softens for e in friction):
@@ -109,8 +113,13 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     ends = np.exp(centre)
     unit = shown_unit("m", optimum.problem.data.motion)
     p = min(1.0, len(t) * float(special.stdtr(dof, -t[best])))
-    size, spread = rise[best] / values[low], error[best] / values[low]
-    return Stiffening(float(ends[low]), float(ends[high]), unit, float(size), float(spread), p)
+    rise, error = rise[best] / values[low], error[best] / values[low]
+    numbers = {"low": ends[low], "high": ends[high], "rise": rise, "stderr": error}
+    text = (
+        f"stiffness rises with amplitude, by {with_unit(100.0 * rise, 100.0 * error, '%')} from "
+        f"{ends[low]:.3g} to {ends[high]:.3g} {unit}, which this law cannot describe"
+    )
+    return ResidualTest("stiffening", p, text, numbers)
 
 
 def _bands(x: FloatArray) -> tuple[BoolArray, NDArray[np.int64]]:
@@ -123,92 +132,13 @@ def _bands(x: FloatArray) -> tuple[BoolArray, NDArray[np.int64]]:
     return kept, band
 
 
-@dataclass(frozen=True)
-class Trend:
-    """How the data depart from the fitted model along one covariate."""
+def groups(optimum: Optimum, space: ResidualSpace) -> Iterator[ResidualTest]:
+    """Yield how the gain differs between groups of rows that a column labels, such as devices.
 
-    covariate: str  # "amplitude", "frequency" or "drive"
-    low: float  # its range, SI units (Hz for frequency)
-    high: float
-    unit: str
-    # changes from `low` to `high` of ln of the real and imaginary part of friction's stiffness,
-    # data over model, by a straight line over the covariate's logarithm: -0.36 is a fall by 30 %.
-    # The stiffness is that of friction and springs together where only their sum is determined
-    stiffness: Coefficient
-    loss: Coefficient
-    largest: float  # largest relative departure of the response by the smooth curve
-    p_value: float  # probability of such a departure by noise alone
-
-    @property
-    def brief(self) -> str:
-        """The departure without its range."""
-        return f"over {self.covariate} {self._changes or self._departure}"
-
-    @property
-    def _changes(self) -> str:
-        """How friction's stiffness and loss change against the model's; "" if neither does."""
-        parts = [
-            f"{name} {_change(part)}"
-            for name, part in (("stiffness", self.stiffness), ("loss", self.loss))
-            if abs(part.value) > 2.0 * part.stderr
-        ]
-        return f"friction's {' and '.join(parts)} against the model's" if parts else ""
-
-    @property
-    def _departure(self) -> str:
-        size = "more than tenfold"
-        if self.largest < _LARGEST_DEPARTURE:
-            size = f"by up to {percent(self.largest)}"
-        return f"the data depart from the model {size}"
-
-    def __str__(self) -> str:
-        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
-        text = f"over {self.covariate}, {ends}, {self._departure}"
-        return f"{text} ({self._changes})" if self._changes else text
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Runs of equal sign in the residuals, in the order of one covariate."""
-
-    covariate: str
-    runs: int
-    expected: float
-    p_value: float
-
-    def __str__(self) -> str:
-        return f"{self.runs} runs of sign over {self.covariate}, {self.expected:.0f} expected"
-
-
-@dataclass(frozen=True)
-class GroupsDiffer:
-    """How the gain differs between groups of rows that a column labels, such as devices."""
-
-    column: str
-    lowest: tuple[str, float]  # label, and its gain over the model's
-    highest: tuple[str, float]
-    p_value: float
-
-    @property
-    def scatter(self) -> float:
-        """Half the range of ln gain."""
-        return 0.5 * float(np.log(self.highest[1] / self.lowest[1]))
-
-    def __str__(self) -> str:
-        ends = [
-            f"{percent(abs(gain - 1.0))} {'below' if gain < 1.0 else 'above'} the model at {label}"
-            for label, gain in (self.lowest, self.highest)
-        ]
-        return f"the gain differs with {self.column}: {' and '.join(ends)}"
-
-
-def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
-    """Return the differences between the groups of each column of labels.
-
-    The amplitude has to vary within each group: otherwise they are levels, which trends test.
+    The amplitude has to vary within each group: otherwise they are levels, which trends test. The
+    `scatter` is half the range of ln gain.
     """
     data = optimum.problem.data
-    differences = []
     amplitude = np.log(optimum.problem.stiffness_data.amplitude)
     columns = {} if "verdict" in data.quality else dict(data.quality)  # not the extraction's
     if data.level is not None:
@@ -227,14 +157,26 @@ def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
                 ratio = np.log(np.abs(data.response / optimum.problem.predict(optimum.theta)))
             ratio[(data.harmonic != 1) | ~np.isfinite(ratio)] = np.nan
             gains = [float(np.exp(np.nanmedian(ratio[rows]))) for rows in members]
-            low, high = ((str(names[i]), gains[i]) for i in (np.argmin(gains), np.argmax(gains)))
-            differences.append(GroupsDiffer(name, low, high, p))
-    return differences
+            low, high = int(np.argmin(gains)), int(np.argmax(gains))
+            parts = [
+                f"{percent(abs(gains[i] - 1.0))} {'below' if gains[i] < 1.0 else 'above'} the "
+                f"model at {names[i]}"
+                for i in (low, high)
+            ]
+            text = f"the gain differs with {name}: {' and '.join(parts)}"
+            scatter = 0.5 * float(np.log(gains[high] / gains[low]))
+            yield ResidualTest("groups", p, text, {"scatter": scatter}, name)
 
 
-def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
-    """Return the departures over each covariate that varies enough."""
-    departures = []
+def trends(optimum: Optimum, space: ResidualSpace) -> Iterator[ResidualTest]:
+    """Yield how the data depart from the fitted model over each covariate that varies enough.
+
+    `stiffness` and `loss` are the changes of ln of the real and imaginary part of friction's
+    stiffness, data over model, over the range of the covariate, by a straight line over its
+    logarithm: -0.36 is a fall by 30 %. The stiffness is that of friction and springs together where
+    only their sum is determined. `largest` is the largest relative departure of the response by the
+    smooth curve.
+    """
     friction, relative = _friction_parts(optimum), RelativeSpace(optimum)
     for name, values, unit in covariates(optimum):
         x = np.log(values)
@@ -244,22 +186,31 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
             continue
         unit_range = 2.0 * (x - x.min()) / np.ptp(x) - 1.0
         shape = legendre.legvander(unit_range, degree)[:, 1:].T
-        changes = np.concatenate([shape, 1j * shape])
-        p = space.p_value(changes)
+        changes_of_response = np.concatenate([shape, 1j * shape])
+        p = space.p_value(changes_of_response)
         if np.isnan(p):
             continue
         stiffness, loss = (relative.coefficient(0.5 * unit_range * part) for part in friction)
         with np.errstate(over="ignore", invalid="ignore"):
-            sizes = np.abs(np.expm1(relative.fitted(changes)))
+            sizes = np.abs(np.expm1(relative.fitted(changes_of_response)))
         largest = float(np.where(np.isnan(sizes), np.inf, sizes).max())
-        ends = float(values.min()), float(values.max())
-        departures.append(Trend(name, *ends, unit, stiffness, loss, largest, p))
-    return departures
+        departure = "the data depart from the model more than tenfold"
+        if largest < _LARGEST_DEPARTURE:
+            departure = f"the data depart from the model by up to {percent(largest)}"
+        parts = [
+            f"{part} {_change(change)}"
+            for part, change in (("stiffness", stiffness), ("loss", loss))
+            if abs(change.value) > 2.0 * change.stderr
+        ]
+        changes = f"friction's {' and '.join(parts)} against the model's" if parts else ""
+        ends = f"from {values.min():.3g} to {values.max():.3g} {unit}".rstrip()
+        text = f"over {name}, {ends}, {departure}{f' ({changes})' if changes else ''}"
+        numbers = {"stiffness": stiffness, "loss": loss, "largest": largest}
+        yield ResidualTest("trend", p, text, numbers, name, f"over {name} {changes or departure}")
 
 
-def runs(optimum: Optimum, space: ResidualSpace) -> list[Runs]:
-    """Return the number of runs of the residuals' signs over each covariate."""
-    counts = []
+def runs(optimum: Optimum, space: ResidualSpace) -> Iterator[ResidualTest]:
+    """Yield the number of runs of equal sign in the residuals, in the order of each covariate."""
     for name, values, _ in covariates(optimum):
         order = np.argsort(values, kind="stable")
         count, mean, variance, signs = 0, 0.0, 0.0, 0
@@ -273,8 +224,8 @@ def runs(optimum: Optimum, space: ResidualSpace) -> list[Runs]:
             signs += n
         if signs >= 2 * _FEWEST_SIGNS and variance > 0.0:
             z = (count - mean + 0.5) / np.sqrt(variance)
-            counts.append(Runs(name, count, mean, float(special.ndtr(z))))
-    return counts
+            text = f"{count} runs of sign over {name}, {mean:.0f} expected"
+            yield ResidualTest("runs", float(special.ndtr(z)), text, {"runs": count}, name)
 
 
 def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
