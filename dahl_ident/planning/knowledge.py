@@ -151,16 +151,21 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
         return _of_records(
             source, source.draws(_POSTERIOR_DRAWS, seed) if sampled else None, ranges, draws, rng
         )
+    values = np.asarray(source.draws(draws, seed)) if sampled else None
+    return _of_table(source, values, ranges, draws, rng)
+
+
+def _of_table(
+    source: Any, values: FloatArray | None, ranges: Ranges, draws: int, rng: np.random.Generator
+) -> Knowledge:
+    """Return the knowledge from a fit of a table with all its sources of error, or a posterior."""
+    problem = source.problem
+    errors: ErrorModel | None = source.errors if values is None else None
+    model, assumed = _with_assumed(problem.model)
     centre, std = _moments(problem.parameters, ranges)
-    prior = _of_ranges(problem.parameters, centre, std)
-    if sampled:
-        values, P = np.asarray(source.draws(draws, seed)), len(problem.names)
-        scale: Any = values[:, P] if values.shape[1] > P else np.ones(draws)
-        drawn = at = problem.to_search(values[:, :P])
-    else:
-        optimum = source.optimum
-        at = np.array(optimum.theta, dtype=np.float64)
-        finite = np.isfinite(at) & np.isfinite(optimum.values)
+    if values is None:
+        theta, optimum = np.array(source.optimum.theta, dtype=np.float64), source.optimum
+        finite = np.isfinite(theta) & np.isfinite(optimum.values)
         for i in np.flatnonzero(~finite | ~np.isfinite(np.diagonal(optimum.covariance))):
             name = problem.names[i]
             if np.isinf(std[i]):
@@ -169,31 +174,46 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
                     f"{argument('ranges', {name: (LOW, HIGH)})}, or plan from the model with "
                     f"{argument('ranges')}"
                 )
-        if source.errors is not None:
-            return _of_errors(source, prior, draws, rng)
-        at = np.where(finite, at, centre)
-        scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
-        covariance = np.linalg.inv(problem.information(at, scale) + np.diag(1.0 / std**2))
-        drawn = _drawn(rng, at, covariance, draws, problem.parameters)
-    model, assumed = _with_assumed(problem.model)
-    wider = problem.like(model=model) if assumed else problem
-    theta = _among(wider.parameters, problem.names, drawn)
-    at = _among(wider.parameters, problem.names, at)
-    noise, cycles = _row_noise(wider, float(np.median(scale)))
+    if errors is not None:
+        wider, names = errors.problem, (*problem.names, *assumed)
+        kept = [i for i, name in enumerate(errors.names) if name in names]
+        parameters, part = tuple(wider.parameters[i] for i in kept), np.ix_(kept, kept)
+        theta = _drawn(rng, errors.theta[kept], errors.covariance[part], draws, parameters)
+        information = np.linalg.inv(errors.covariance)[part]
+        stated, cycles = _row_noise(wider, 0.0)
+        noise = float(np.hypot(stated, errors.rms(NOISE)))
+    else:
+        wider = problem.like(model=model) if assumed else problem
+        parameters = wider.parameters
+        if values is None:
+            at = np.where(finite, theta, centre)
+            scale: Any = optimum.scale if np.isfinite(optimum.scale) else 1.0
+            covariance = np.linalg.inv(problem.information(at, scale) + np.diag(1.0 / std**2))
+            theta = _drawn(rng, at, covariance, draws, problem.parameters)
+        else:
+            P = len(problem.names)
+            scale = values[:, P] if values.shape[1] > P else np.ones(draws)
+            theta = at = problem.to_search(values[:, :P])
+        theta, at = (_among(parameters, problem.names, part) for part in (theta, at))
+        information = wider.information(at, scale) + _of_assumed(parameters, assumed)
+        noise, cycles = _row_noise(wider, float(np.median(scale)))
+    prior = _of_ranges(problem.parameters, centre, std)
     return Knowledge(
         model,
-        wider.parameters,
+        parameters,
         theta,
-        _stated(source, wider.parameters),
-        _repeated(wider.information(at, scale) + _of_assumed(wider.parameters, assumed), draws),
-        _among(wider.parameters, problem.names, prior, 0.0),
+        _stated(source, parameters),
+        _repeated(information, draws),
+        _among(parameters, problem.names, prior, 0.0),
         tuple(assumed),
-        wider.sensors,
-        wider.data.motion,
+        problem.sensors,
+        problem.data.motion,
         noise,
         cycles,
         wider,
-        steady=wider.steady,
+        0.0 if errors is None else errors.rms(RUNS),
+        errors,
+        steady=problem.steady,
     )
 
 
@@ -223,33 +243,6 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
         _repeated(_of_assumed(parameters, assumed), draws),
         _among(parameters, names, _of_ranges(free, centre, std), 0.0),
         tuple(assumed),
-    )
-
-
-def _of_errors(fit: Any, prior: FloatArray, draws: int, rng: np.random.Generator) -> Knowledge:
-    """Return the knowledge from a fit with all its sources of error."""
-    errors: ErrorModel = fit.errors
-    fitted = errors.optimum.problem
-    model, assumed = _with_assumed(fitted.model)
-    kept = [i for i, name in enumerate(errors.names) if name in (*fitted.names, *assumed)]
-    parameters, part = tuple(errors.problem.parameters[i] for i in kept), np.ix_(kept, kept)
-    stated, cycles = _row_noise(errors.problem, 0.0)
-    return Knowledge(
-        model,
-        parameters,
-        _drawn(rng, errors.theta[kept], errors.covariance[part], draws, parameters),
-        _stated(fit, parameters),
-        _repeated(np.linalg.inv(errors.covariance)[part], draws),
-        _among(parameters, fitted.names, prior, 0.0),
-        tuple(assumed),
-        fitted.sensors,
-        fitted.data.motion,
-        float(np.hypot(stated, errors.rms(NOISE))),
-        cycles,
-        errors.problem,
-        errors.rms(RUNS),
-        errors,
-        steady=fitted.steady,
     )
 
 
