@@ -29,7 +29,7 @@ _FREQUENCIES = 12  # most frequencies: six in each decade of the default range
 _BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee, if no limit is given
 _SOFTEST = 3e-3  # smallest drive as a fraction of the largest
 _CHECKED_DRAWS = 25  # draws at which the number of steady amplitudes is counted
-_OF_DRAWS = ("amplitude", "force", "rows", "variance")  # fields with an axis of draws
+OF_DRAWS = ("amplitude", "force", "rows", "variance")  # fields with an axis of draws
 LEAST_CYCLES = 2  # measured at each level: a single cycle does not show its noise
 _LEAST_SETTLING = 1  # cycles before measuring
 _QUANTILE = 0.9  # quantile of the draws by which the motion must have settled
@@ -76,12 +76,8 @@ class Candidates:
             level=self.level[chosen],
             frequency_hz=self.frequency_hz[chosen],
             motions=tuple(self.motions[k] for k in chosen.tolist()) if self.motions else (),
-            **{name: getattr(self, name)[:, chosen] for name in _OF_DRAWS},
+            **{name: getattr(self, name)[:, chosen] for name in OF_DRAWS},
         )
-
-    def at_draws(self, draws: IntArray) -> Candidates:
-        """Return the candidates at some of the draws."""
-        return replace(self, **{name: getattr(self, name)[draws] for name in _OF_DRAWS})
 
 
 def grid(question: PlanRequest, limits: BenchLimits, count: int) -> tuple[FloatArray, FloatArray]:

@@ -17,7 +17,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.errors import ValidationError
-from dahl_ident.planning.candidates import Candidates
+from dahl_ident.planning.candidates import OF_DRAWS, Candidates
 from dahl_ident.planning.design import Design, Term, packed_information
 from dahl_ident.planning.knowledge import Knowledge, spread, units_of
 from dahl_ident.planning.question import RESPONSE, PlanRequest, is_expanded, least_factor, powers_of
@@ -97,11 +97,11 @@ class Forecast:
     def thinned(self) -> Forecast:
         """Return the forecast at the few draws that a search averages over."""
         most = SEARCHED if self.departures == 0 else _SEARCHED_WITH_DEPARTURES
-        some = spread(len(self.before), most)
+        some, candidates = spread(len(self.before), most), self.candidates
         return replace(
             self,
             knowledge=self.knowledge.only(some),
-            candidates=self.candidates.at_draws(some),
+            candidates=replace(candidates, **{n: getattr(candidates, n)[some] for n in OF_DRAWS}),
             before=self.before[some],
             searched=self.searched[some],
             directions={name: d[some] for name, d in self.directions.items()},

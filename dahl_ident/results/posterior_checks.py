@@ -30,7 +30,7 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.bayes.density import SCALE, TAIL_DOF, Density
-from dahl_ident.bayes.priors import JointPrior, ParameterPrior
+from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data.storage import library
 from dahl_ident.diagnostics.checks import assumptions
@@ -167,21 +167,18 @@ class PriorInfluence:
 
 def prior_influences(prior: JointPrior, points: FloatArray) -> tuple[PriorInfluence, ...]:
     """Return the parameters that the prior determines, from posterior draws of theta."""
-    influences = [_influence(p, points[:, i]) for i, p in enumerate(prior.priors)]
-    return tuple(influence for influence in influences if influence is not None)
-
-
-def _influence(prior: ParameterPrior, theta: FloatArray) -> PriorInfluence | None:
-    """Return the prior's influence on one parameter; None where the data determine it."""
-    low, high = np.quantile(theta, [0.16, 0.84])
-    width = float(high - low) / prior.width
-    probability = prior.probability(theta)
-    below, above = np.mean(probability < _PRIOR_END), np.mean(probability > 1.0 - _PRIOR_END)
-    at_lower, at_upper = bool(below >= _PRIOR_END), bool(above >= _PRIOR_END)
-    if width < _NEARLY_AS_WIDE and not (at_lower or at_upper):
-        return None
-    contradicted = bool(max(below, above) > 1.0 - _PRIOR_END)
-    return PriorInfluence(prior.parameter.name, width, at_lower, at_upper, contradicted)
+    influences = []
+    for part, theta in zip(prior.priors, points.T, strict=False):
+        low, high = np.quantile(theta, [0.16, 0.84])
+        width = float(high - low) / part.width
+        probability = part.probability(theta)
+        below, above = np.mean(probability < _PRIOR_END), np.mean(probability > 1.0 - _PRIOR_END)
+        at_lower, at_upper = bool(below >= _PRIOR_END), bool(above >= _PRIOR_END)
+        if width >= _NEARLY_AS_WIDE or at_lower or at_upper:
+            contradicted = bool(max(below, above) > 1.0 - _PRIOR_END)
+            name = part.parameter.name
+            influences.append(PriorInfluence(name, width, at_lower, at_upper, contradicted))
+    return tuple(influences)
 
 
 def to_arviz(density: Density, sample: ChainSample, seed: int) -> Any:

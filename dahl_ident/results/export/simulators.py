@@ -56,7 +56,8 @@ def device(result: Any, form: str, supported: Mapping[str, str]) -> Device:
             "verdict"
         )
     for element in result.model.elements:
-        values = _values(element)
+        prefix = f"{element.name}_" if getattr(element, "name", None) else ""
+        values = {p.name.removeprefix(prefix): short(p.value) for p in element.parameters}
         if element.kind in LUMPED and element.kind in supported:
             lumped[LUMPED[element.kind]] += values[LUMPED[element.kind]]
         elif element.kind in supported:
@@ -76,12 +77,6 @@ def device(result: Any, form: str, supported: Mapping[str, str]) -> Device:
 def short(value: float) -> float:
     """Return a number rounded to ten digits."""
     return float(f"{value:.10g}")
-
-
-def _values(element: Any) -> dict[str, float]:
-    """Return the values of an element by the names of parameters in its class."""
-    prefix = f"{element.name}_" if getattr(element, "name", None) else ""
-    return {p.name.removeprefix(prefix): short(p.value) for p in element.parameters}
 
 
 def _note_on_exponent(law: Law) -> tuple[str, ...]:
