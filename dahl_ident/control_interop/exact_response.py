@@ -25,26 +25,9 @@ _CONTINUATION_STEP = 0.005  # of a continuation: change of ln of drive and of fr
 _MOST_STEPS = 40  # between two points; points farther apart do not belong to one sweep
 
 
-class ExactMotions(NamedTuple):
-    """All motions of each point, (points, most), in order of amplitude; NaN after the last.
-
-    `harmonics` are X_k, k from 0 to 9, (points, most, 10); `multiplier` is the largest modulus of
-    the Floquet multipliers of a cycle. `followed` is the index of the stable motion of each point
-    that a sweep follows, -1 where there is none.
-    """
-
-    harmonics: ComplexArray
-    multiplier: FloatArray
-    followed: IntArray
-
-
 class _Orbit(NamedTuple):
     harmonics: ComplexArray
     multiplier: float
-
-    @property
-    def fundamental(self) -> complex:
-        return complex(self.harmonics[1])
 
     @property
     def stable(self) -> bool:
@@ -53,8 +36,12 @@ class _Orbit(NamedTuple):
 
 def exact_motions(
     model: Model, omega: FloatArray, drive: FloatArray, near: ComplexArray, unique: BoolArray
-) -> ExactMotions:
+) -> tuple[ComplexArray, FloatArray, IntArray]:
     """Return the exact motions of points, (n,), near estimates of their fundamentals, (n, most).
+
+    The harmonics X_k, (n, most, 10), in order of amplitude, NaN after the last; the largest moduli
+    of Floquet's multipliers of a cycle, (n, most); and the index of the stable motion of each point
+    that a sweep follows, -1 where there is none.
 
     If the estimate of a point is `unique`, so is the motion, which is computed from rest. Otherwise
     the starts are all estimates, and all motions of the adjacent points, followed in small steps.
@@ -90,8 +77,8 @@ def exact_motions(
         for i in np.flatnonzero(solution.found & np.isfinite(solution.multiplier)).tolist():
             at_point = motions[rows[i]]
             motion = _Orbit(solution.harmonics[i], float(solution.multiplier[i]))
-            X = motion.fundamental
-            if all(abs(X - other.fundamental) >= _SAME_MOTION * abs(X) for other in at_point):
+            X = motion.harmonics[1]
+            if all(abs(X - other.harmonics[1]) >= _SAME_MOTION * abs(X) for other in at_point):
                 at_point.append(motion)
                 new.append(i)
         return np.array(new, dtype=np.intp)
@@ -122,7 +109,7 @@ def exact_motions(
     if shooting.system.odd:
         follow(np.flatnonzero(continues), None, one_sided=True, stable=True)
     for at_point in motions:
-        at_point.sort(key=lambda motion: abs(motion.fundamental))
+        at_point.sort(key=lambda motion: abs(motion.harmonics[1]))
     followed = _followed(motions, is_start)[points]
     most = max(near.shape[1], *(len(motions[point]) for point in points))
     harmonics = np.full((points.size, most, len(HARMONICS)), np.nan, dtype=np.complex128)
@@ -130,7 +117,7 @@ def exact_motions(
     for row, point in enumerate(points.tolist()):
         for order, motion in enumerate(motions[point]):
             harmonics[row, order], multiplier[row, order] = motion
-    return ExactMotions(harmonics, multiplier, followed)
+    return harmonics, multiplier, followed
 
 
 def _followed(motions: list[list[_Orbit]], is_start: BoolArray) -> IntArray:
@@ -144,7 +131,7 @@ def _followed(motions: list[list[_Orbit]], is_start: BoolArray) -> IntArray:
         stable = [i for i, motion in enumerate(at_point) if motion.stable]
         last = None if starts else last
         if stable:
-            fundamentals = [at_point[i].fundamental for i in stable]
+            fundamentals = [complex(at_point[i].harmonics[1]) for i in stable]
             nearest = 0 if last is None else int(np.argmin(np.abs(np.array(fundamentals) - last)))
             result[point], last = stable[nearest], fundamentals[nearest]
     return result

@@ -225,11 +225,11 @@ def response(
     exact = moving if steady == "exact" and not why else np.zeros(moving.shape, dtype=np.bool_)
     if exact.any():
         unique = points.unique & (points.linear.imag[exact] >= 0.0)
-        motions = exact_motions(plant, omega[exact], u[exact], X[exact], unique)
-        padding = ((0, 0), (0, motions.multiplier.shape[1] - X.shape[1]))
+        orbits, moduli, followed = exact_motions(plant, omega[exact], u[exact], X[exact], unique)
+        padding = ((0, 0), (0, moduli.shape[1] - X.shape[1]))
         multiplier = np.pad(multiplier, padding, constant_values=np.nan)
         harmonics = np.pad(harmonics, (*padding, (0, 0)), constant_values=np.nan)
-        harmonics[exact], multiplier[exact], chosen[exact] = motions
+        harmonics[exact], multiplier[exact], chosen[exact] = orbits, moduli, followed
     exists = np.isfinite(harmonics[..., 1])
     count = exists.sum(axis=1).reshape(shape)
     active = (points.linear.imag < 0.0).reshape(shape)
