@@ -248,7 +248,10 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, periods: 
     sampled = np.flatnonzero((counts >= _FEWEST_PER_CYCLE) & ~_with_gap(time, edges))
     start, stop, n = edges[sampled], edges[sampled + 1], counts[sampled]
     fits = []
-    for first, last in groups_of_cycles(cuts):
+    # in groups of cycles whose samples fit in the cache
+    at = np.arange(cuts[0], cuts[-1], _SAMPLES_AT_ONCE)
+    groups = np.unique(np.searchsorted(cuts, at, side="right") - 1).tolist()
+    for first, last in pairwise([*groups, cuts.size - 1]):
         inside = slice(int(cuts[first]), int(cuts[last]))
         per_cycle = counts[first:last]
         omega = np.repeat(2.0 * np.pi * periods / np.diff(edges[first : last + 1]), per_cycle)
@@ -263,12 +266,6 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, periods: 
     noise = np.sqrt(2.0 * variance / n) / amplitude
     frequency = _log_frequency(start, stop, np.angle(phasor), periods)
     return Cycles(start, stop, np.log(amplitude), noise, frequency)
-
-
-def groups_of_cycles(cuts: IntArray) -> Iterator[tuple[int, int]]:
-    """Yield the first cycle, and that after the last, of groups whose samples fit in the cache."""
-    groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _SAMPLES_AT_ONCE), side="right") - 1
-    yield from pairwise([*np.unique(groups).tolist(), cuts.size - 1])
 
 
 def sine_in_each(

@@ -147,10 +147,8 @@ def _refuse_drift(segment: Segment) -> None:
     dof = 2 * cycle.size - 4
     if dof < 1:
         return
-    bounds = np.column_stack([cuts[:-1], cuts[1:]])[cycle].ravel()
-    phasor, _ = sine_in_each(thinned.theta, thinned.channels[0], bounds, counts[cycle])
-    phasors = np.zeros(counts.size, dtype=np.complex128)
-    phasors[cycle] = phasor
+    every, _ = _EachCycle(thinned.theta, thinned.channels[0], cuts).fits
+    phasor, phasors = every[cycle], np.nan_to_num(every)
     power = np.abs(np.fft.fft(phasors, _PADDED * counts.size)) ** 2 / cycle.size
     peak = int(np.argmax(power))
     slip = float(np.fft.fftfreq(power.size)[peak])  # relative deviation of the frequency

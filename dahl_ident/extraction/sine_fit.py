@@ -410,14 +410,9 @@ def normal_equations(
     return normal, right
 
 
-def is_solvable(normal: FloatArray) -> bool:
-    """Return whether a normal matrix is well-conditioned."""
-    return bool(np.linalg.cond(normal) < _LARGEST_CONDITION)
-
-
 def checked_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
     """Return the inverse of a normal matrix, or raise an error if it is ill-conditioned."""
-    if not is_solvable(normal):
+    if not np.linalg.cond(normal) < _LARGEST_CONDITION:
         raise ExtractionError(
             f"the samples around t = {segment.centre:.6g} s do not separate the harmonics of "
             f"{segment.omega / (2.0 * np.pi):.6g} Hz apart; expected samples spread over whole "

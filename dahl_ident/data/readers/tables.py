@@ -245,32 +245,43 @@ def dictionary_source(
 
 def _channels(content: Any, name: str, units: Any = None) -> Iterator[RawChannel]:
     """Yield the columns; `units` are given by name, or in the order of a list of names."""
-    named = _is_list_of(Mapping, content) and all("name" in c for c in content)
-    sampled = named and any("fs" in c or "time" in c for c in content)
-    if sampled and all("data" in c for c in content):
-        yield from _sdypy(content, name)
-    elif named and all(any(isinstance(c.get(v), list) for v in _VALUES) for c in content):
-        for column in content:
-            yield from _columns({str(column["name"]): column}, name, units)
-    elif _is_list_of(dict, content):
-        keys = list(dict.fromkeys(key for row in content for key in row))
-        refuse_many(name, len(keys), "columns")
-        columns = {key: [row.get(key) for row in content] for key in keys}
-        yield from _columns(columns, name, units)
+    if isinstance(content, dict):
+        common = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
+        units = content.get("units", units or common)
+        rows = [content[key] for key in ("data", "rows") if _is_list_of(list, content.get(key))]
+        tables = [content.get(key) for key in _TABLES]
+        nested = [t for t in tables if isinstance(t, dict) or _is_list_of((list, dict), t)]
+        if "columns" in content and rows:
+            columns = _transposed(content["columns"], rows[0], name)
+            if isinstance(units, list) and len(units) == len(columns):
+                units = dict(zip(columns, units, strict=True))
+            yield from _columns(columns.items(), name, units)
+        elif nested:
+            yield from _channels(nested[0], name, units)
+        else:
+            yield from _columns(content.items(), name, units)
     elif _is_list_of(list, content):
         header = all(isinstance(cell, str) for cell in content[0])
         labels = content[0] if header else [_UNNAMED.format(i + 1) for i in range(len(content[0]))]
-        yield from _columns(_transposed(labels, content[header:], name), name, units)
-    elif isinstance(content, dict):
-        yield from _tables(content, name, units)
-    else:
+        yield from _columns(_transposed(labels, content[header:], name).items(), name, units)
+    elif not _is_list_of(Mapping, content):
         raise DataError(
             f"{name}: found a {type(content).__name__}; expected an object of columns, a list of "
             "rows, or a list of channels"
         )
+    elif all("name" in c and "data" in c for c in content) and any(
+        "fs" in c or "time" in c for c in content
+    ):
+        yield from _sdypy(content, name)
+    elif all("name" in c and any(isinstance(c.get(v), list) for v in _VALUES) for c in content):
+        yield from _columns([(str(c["name"]), c) for c in content], name, units)
+    else:
+        keys = list(dict.fromkeys(key for row in content for key in row))
+        refuse_many(name, len(keys), "columns")
+        yield from _columns([(k, [row.get(k) for row in content]) for k in keys], name, units)
 
 
-def _is_list_of(kind: type, content: Any) -> bool:
+def _is_list_of(kind: type | tuple[type, ...], content: Any) -> bool:
     is_list = isinstance(content, Sequence) and not isinstance(content, str) and len(content) > 0
     return is_list and all(isinstance(one, kind) for one in content)
 
@@ -285,41 +296,23 @@ def _transposed(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
     return {str(label): [row[i] for row in rows] for i, label in enumerate(labels)}
 
 
-def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[RawChannel]:
-    """Yield the columns of an object, or of a table in it."""
-    common = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
-    units = content.get("units", units or common)
-    rows = [content[key] for key in ("data", "rows") if _is_list_of(list, content.get(key))]
-    if "columns" in content and rows:
-        columns = _transposed(content["columns"], rows[0], name)
-        if isinstance(units, list) and len(units) == len(columns):
-            units = dict(zip(columns, units, strict=True))
-        yield from _columns(columns, name, units)
-        return
-    for table in (content.get(key) for key in _TABLES):
-        nested = isinstance(table, list) and any(isinstance(v, (list, dict)) for v in table)
-        if nested or isinstance(table, dict):
-            yield from _channels(table, name, units)
-            return
-    yield from _columns(content, name, units)
-
-
-def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[RawChannel]:
+def _columns(content: Iterable[tuple[str, Any]], name: str, units: Any) -> Iterator[RawChannel]:
     stated = units if isinstance(units, dict) else {}
     known = {plain(str(key)): unit for key, unit in stated.items()}
     index: Any = None
-    for key, value in content.items():
+    for key, value in content:
         unit = known.get(plain(key))
-        if isinstance(value, dict) and any(v in value for v in _VALUES):
-            values = next(value[v] for v in _VALUES if v in value)
-            yield _channel(key, values, next((value[u] for u in _UNITS if u in value), unit), name)
-        elif isinstance(value, dict) and value and all(row.isdecimal() for row in value):
+        if isinstance(value, Mapping) and any(v in value for v in _VALUES):
+            unit = next((value[u] for u in _UNITS if u in value), unit)
+            value = next(value[v] for v in _VALUES if v in value)
+        elif isinstance(value, Mapping) and value and all(row.isdecimal() for row in value):
             index = index or value.keys()
             if value.keys() != index:
                 raise DataError(f"{name}: column {key!r} has other rows than the columns before it")
-            yield _channel(key, [value[row] for row in index], unit, name)
-        elif isinstance(value, list):
-            yield _channel(key, value, unit, name)
+            value = [value[row] for row in index]
+        elif not isinstance(value, list):
+            continue
+        yield _channel(key, value, unit, name)
 
 
 def _channel(key: Any, values: Any, unit: Any, name: str) -> RawChannel:

@@ -13,7 +13,7 @@ import warnings
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import islice, product, zip_longest
+from itertools import islice, zip_longest
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from dahl_ident.data.raw_columns import (
 from dahl_ident.data.readers.file import File, refuse_many, utf8
 from dahl_ident.data.readers.tables import (
     Header,
+    Run,
     are_units,
     best_run,
     contradict,
@@ -73,8 +74,9 @@ _LIKE_DATA = (
 )
 _INTEGER = re.compile(r"-?\d{1,18}")
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
-_DIALECTS = tuple(product(("\t", ";", ",", "|", None), (".", ",", ".,", ",.")))
-_LAST_DIALECTS = ((":", "."), (":", ","))  # tried last, as times of day contain colons
+_DELIMITERS = (("\t", ";", ",", "|", None), (":",))  # colons last, as in times of day
+_MARKS = (".", ",", ".,", ",.")  # decimal mark, and that of thousands
+
 
 _Parsed = tuple[list[NDArray[Any]], Callable[[int], int], list[int]]
 """Columns, the line of each row from the first, and the first rows of further runs."""
@@ -82,7 +84,7 @@ _Parsed = tuple[list[NDArray[Any]], Callable[[int], int], list[int]]
 
 @dataclass(frozen=True)
 class _Layout:
-    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header.
+    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, score, header.
 
     `repeated` is the line above the numbers, which identifies a second header in the file;
     `comments` are all lines above them if the header is in comments.
@@ -92,6 +94,7 @@ class _Layout:
     mark: str
     start: int
     width: int
+    score: int
     header: Header
     repeated: str = ""
     comments: tuple[str, ...] = ()
@@ -187,58 +190,44 @@ def _split(line: str, delimiter: str | None) -> list[str]:
 
 
 def _layout(lines: list[str], name: str) -> _Layout:
-    skipped = [_skipped(text) for text in lines]
-    texts = [text for text, skip in zip(lines, skipped, strict=True) if not skip]
-    for dialects in (_DIALECTS, _LAST_DIALECTS):
-        trials = (
-            _in_dialect(lines, skipped, delimiter, mark)
-            for delimiter, mark in _possible(dialects, texts)
-        )
-        # a header that fits the columns has precedence over the number of numbers
-        best = max(filter(None, trials), key=lambda trial: trial[0], default=None)
-        if best is not None and best[0] > (False, 0):
-            return best[1]
+    for delimiters in _DELIMITERS:
+        layouts = [layout for delimiter in delimiters for layout in _layouts(lines, delimiter)]
+        if layouts:  # a header that fits the columns has precedence over the number of numbers
+            return max(layouts, key=lambda layout: (bool(layout.header.names), layout.score))
     raise DataError(
         f"{name}: no table of numbers found; expected at least two columns of numbers under a "
         "header line"
     )
 
 
-def _possible(
-    dialects: Iterable[tuple[str | None, str]], texts: list[str]
-) -> Iterator[tuple[str | None, str]]:
-    """Yield the dialects whose delimiter, and decimal comma if any, occur in the lines."""
-    text = "\n".join(texts)
-    blanks = any(len(_BEFORE_BRACKET.sub("", line).split(None, 1)) > 1 for line in texts)
-    for delimiter, mark in dialects:
-        split = blanks if delimiter is None else delimiter in text
-        quoted = delimiter is None or delimiter not in mark or '"' in text
-        if split and quoted and ("," not in mark or "," in text):
-            yield delimiter, mark
+def _layouts(lines: list[str], delimiter: str | None) -> Iterator[_Layout]:
+    """Yield the layout for each decimal mark with which there are numbers."""
+    rows = [None if _skipped(text) else _split(text, delimiter) for text in lines]
+    if all(row is None or len(row) < 2 for row in rows):
+        return
+    for mark in _MARKS:
+        run = best_run(rows, mark)
+        if run is not None and (not mark[1:] or _has_thousands(rows[run.start :], mark)):
+            yield _with_header(lines, rows, run, delimiter, mark)
 
 
-def _in_dialect(
-    lines: list[str], skipped: list[bool], delimiter: str | None, mark: str
-) -> tuple[tuple[bool, int], _Layout] | None:
-    """Return the layout in one dialect and its merit, if there are numbers in it."""
-    rows = [
-        None if skip else _split(text, delimiter) for text, skip in zip(lines, skipped, strict=True)
-    ]
-    run = best_run(rows, mark)
-    if run is None:
-        return None
-    if mark[1:]:  # accepted only if a cell needs the mark of thousands, such as 1,234.5
-        group = rf"\s*[-+]?\d{{1,3}}(?:\{mark[1]}\d{{3}})"
-        has_thousands = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*").fullmatch
-        if not any(has_thousands(cell) for row in rows[run.start :] for cell in row or ()):
-            return None
+def _has_thousands(rows: list[list[str] | None], mark: str) -> bool:
+    """Return whether a cell needs the mark of thousands, such as 1,234.5."""
+    group = rf"\s*[-+]?\d{{1,3}}(?:\{mark[1]}\d{{3}})"
+    needs = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*").fullmatch
+    return any(needs(cell) for row in rows for cell in row or ())
+
+
+def _with_header(
+    lines: list[str], rows: list[list[str] | None], run: Run, delimiter: str | None, mark: str
+) -> _Layout:
+    """Read the header above the numbers."""
     start = run.start
-    repeated = lines[start - 1].strip() if start and not skipped[start - 1] else ""
+    repeated = lines[start - 1].strip() if start and rows[start - 1] is not None else ""
     if repeated:  # the numbers begin below the first of several equal headers
         first = next(i for i, text in enumerate(lines) if text.strip() == repeated)
-        later = next((i for i in range(first + 1, start + 1) if not skipped[i]), start)
-        row = rows[later]
-        start = later if row is not None and len(row) == run.width else start
+        later = next(i for i in range(first + 1, start + 1) if rows[i] is not None)
+        start = later if len(rows[later] or []) == run.width else start
     filled = max((i + 1 for i, c in enumerate(rows[start] or []) if c.strip()), default=run.width)
     named = header([row for row in rows[:start] if row is not None], run.width, filled)
     comments: tuple[str, ...] = ()
@@ -247,8 +236,7 @@ def _in_dialect(
         comments = tuple(text.strip() for text in lines[:start]) if named.names else ()
         repeated = next((text for text in reversed(comments) if text), "")
     repeated = repeated if named.names else ""
-    layout = _Layout(delimiter, mark, start, run.width, named, repeated, comments)
-    return (bool(named.names), run.score), layout
+    return _Layout(delimiter, mark, start, run.width, run.score, named, repeated, comments)
 
 
 def _commented(lines: Iterable[str], delimiter: str | None) -> list[list[str]]:
@@ -288,6 +276,7 @@ def _refuse_data_in_comments(above: list[str], layout: _Layout, name: str) -> No
 def _rows(body: bytes, layout: _Layout, metadata: Mapping[str, Any], file: File) -> _Parsed:
     """Parse a table without its comments, repeated headers, and the lines below it."""
     name = file.name
+    file.lines()  # refuses more than memory may hold
     lines = _LINE_END_TEXT.split(body.decode("utf-8", "replace"))
     end = _end(lines, layout)
     places, runs = array("q"), list[int]()
