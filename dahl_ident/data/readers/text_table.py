@@ -11,9 +11,9 @@ import io
 import re
 import warnings
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import islice, zip_longest
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -78,10 +78,6 @@ _DELIMITERS = (("\t", ";", ",", "|", None), (":",))  # colons last, as in times 
 _MARKS = (".", ",", ".,", ",.")  # decimal mark, and that of thousands
 
 
-_Parsed = tuple[list[NDArray[Any]], Callable[[int], int], list[int]]
-"""Columns, the line of each row from the first, and the first rows of further runs."""
-
-
 @dataclass(frozen=True)
 class _Layout:
     """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, score, header.
@@ -123,8 +119,13 @@ def read_text_table(file: File) -> RawFile:
     count = max(body.count(b"\n"), body.count(b"\r"))
     file.refuse_above_limit(8 * count * layout.width, f"a table of {count} by {layout.width}")
     large = len(body) > _SMALL_TABLE and not metadata.get("text")
-    block = _block(body, layout, rows[layout.start] or [], name) if large else None
-    columns, places, runs = block or _rows(body, layout, metadata, file)
+    first = rows[layout.start] or []
+    columns = _block(body, layout, first, name) if large else None
+    places, runs = array("q"), list[int]()
+    if columns is None:
+        kept = _rows(body, layout, file, places, runs)
+        columns = _block("\n".join(kept).encode(), layout, first, name) if large else None
+        columns = columns or _columns(kept, places, layout, metadata, name)
     named = layout.header
     if trace is not None:
         points, count = int(trace[1]), len(columns[0])
@@ -147,7 +148,7 @@ def read_text_table(file: File) -> RawFile:
         channels,
         headerless=not named.names,
         decimal=layout.mark,
-        row_name=lambda i: f"line {layout.start + 1 + places(i)}",
+        row_name=lambda i: f"line {layout.start + 1 + (places or _filled_lines(body))[i]}",
         metadata=metadata,
         runs=tuple(runs),
         stated={} if metadata else stated_levels(head[: layout.start]),
@@ -273,77 +274,92 @@ def _refuse_data_in_comments(above: list[str], layout: _Layout, name: str) -> No
             raise DataError(f"{name}, line {i + 1}: {_LIKE_DATA.format(above[i].strip()[:40])}")
 
 
-def _rows(body: bytes, layout: _Layout, metadata: Mapping[str, Any], file: File) -> _Parsed:
-    """Parse a table without its comments, repeated headers, and the lines below it."""
-    name = file.name
+def _rows(
+    body: bytes, layout: _Layout, file: File, places: array[int], runs: list[int]
+) -> list[str]:
+    """Return the lines of numbers, without comments, repeated headers, and lines below the table.
+
+    Their `places` in the body are added, and the first rows of `runs` below repeated headers.
+    """
     file.lines()  # refuses more than memory may hold
     lines = _LINE_END_TEXT.split(body.decode("utf-8", "replace"))
     end = _end(lines, layout)
-    places, runs = array("q"), list[int]()
     below = [line.strip()[:60] for line in lines[end:] if line.strip()]
     file.notes.extend(f"left out below the table: {line!r}" for line in below)
     is_open = end == len(lines) and bool(lines[-1])
-    _refuse_cut_end(lines[max(end - _LAST_LINES, 0) : end], is_open, layout, name)
-    parts: list[list[NDArray[Any]]] = []
-    rows: list[list[str]] = []
+    _refuse_cut_end(lines[max(end - _LAST_LINES, 0) : end], is_open, layout, file.name)
+    kept: list[str] = []
     comments = 0
     for place, line in enumerate(lines[:end]):
-        if not line.strip():
-            continue
         if layout.repeated and line.strip() == layout.repeated:
-            while rows and not any(map(CELL[layout.mark].fullmatch, rows[-1])):
-                del rows[-1], places[-1]  # a line of that header
+            while kept and not _numbers_in(kept[-1], layout):
+                del kept[-1], places[-1]  # a line of that header
             runs.append(len(places))
         elif _COMMENT.match(line):
             comments += 1
             if why := _objection(line, comments, layout):
-                raise DataError(f"{name}, line {layout.start + 1 + place}: {why}")
-        else:
-            cells = _split(line, layout.delimiter)
-            if len(cells) > layout.width:
-                raise DataError(
-                    f"{name}: line {layout.start + 1 + place} has {len(cells)} fields; "
-                    f"expected {layout.width} as in the lines above"
-                )
-            if len(rows) == _ROWS_AT_ONCE:
-                parts.append([words(column) for column in zip(*rows, strict=True)])
-                rows = []
-            rows.append(cells + [""] * (layout.width - len(cells)))
+                raise DataError(f"{file.name}, line {layout.start + 1 + place}: {why}")
+        elif line.strip():
+            kept.append(line)
             places.append(place)
     if runs:
-        file.notes.append(
-            "the header is repeated in the file: new runs begin at rows "
-            + listed([i + 1 for i in runs])
-        )
-    if rows:
+        rows = listed([i + 1 for i in runs])
+        file.notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
+    return kept
+
+
+def _columns(
+    lines: list[str], places: array[int], layout: _Layout, metadata: Mapping[str, Any], name: str
+) -> list[NDArray[Any]]:
+    """Parse lines one by one."""
+    parts: list[list[NDArray[Any]]] = []
+    for start in range(0, len(lines), _ROWS_AT_ONCE):
+        rows = [_split(line, layout.delimiter) for line in lines[start : start + _ROWS_AT_ONCE]]
+        for i, cells in enumerate(rows):
+            if len(cells) > layout.width:
+                raise DataError(
+                    f"{name}: line {layout.start + 1 + places[start + i]} has {len(cells)} fields; "
+                    f"expected {layout.width} as in the lines above"
+                )
+            cells += [""] * (layout.width - len(cells))
         parts.append([words(column) for column in zip(*rows, strict=True)])
     texts = metadata.get("text", [])
     if layout.mark[1:]:  # read strictly when they are used: 12,34 is not 1234
         texts = layout.header.names
     columns = []
-    for cells, label in zip_longest(zip(*parts, strict=True), layout.header.names):
-        column = np.concatenate(cells)
+    for pieces, label in zip_longest(zip(*parts, strict=True), layout.header.names):
+        column = np.concatenate(pieces)
         if label not in texts:
             column = _typed(column.tolist(), layout.mark)
         elif metadata:
             column = words(map(as_before_inert, column.tolist()))
         columns.append(column)
-    return columns, places.__getitem__, runs
+    return columns
+
+
+def _filled_lines(body: bytes) -> list[int]:
+    return [i for i, line in enumerate(_LINE_END.split(body)) if line.strip()]
+
+
+def _numbers_in(line: str, layout: _Layout) -> bool:
+    return any(map(CELL[layout.mark].fullmatch, _split(line, layout.delimiter)))
 
 
 def _end(lines: list[str], layout: _Layout) -> int:
     """Return the end of the table: lines of words, "Mean,0.1" or ",," are below."""
-    filled = [i for i in range(len(lines)) if lines[i].strip()]
-    end = len(lines)
-    for i in reversed(filled[1:][-_FOOTER_LINES:]):
+    end, left = len(lines), _FOOTER_LINES
+    for i in range(len(lines) - 1, 0, -1):
+        if not lines[i].strip():
+            continue
         cells = _split(lines[i], layout.delimiter)
         if any(cell.strip() for cell in cells):  # otherwise an empty row of a spreadsheet
-            numbers = any(map(CELL[layout.mark].fullmatch, cells))
             summary = cells[0].strip(" \"':.").casefold() in _SUMMARIES
             words_first = _FOOTER.match(lines[i]) and cells[0].strip() not in _MISSING
-            if not words_first or (numbers and not summary):
+            if not words_first or (_numbers_in(lines[i], layout) and not summary):
                 break
-        end = i
+        end, left = i, left - 1
+        if not left:
+            break
     return end
 
 
@@ -431,7 +447,7 @@ def _refuse_cut_end(lines: list[str], is_open: bool, layout: _Layout, name: str)
         )
 
 
-def _block(body: bytes, layout: _Layout, first: list[str], name: str) -> _Parsed | None:
+def _block(body: bytes, layout: _Layout, first: list[str], name: str) -> list[NDArray[Any]] | None:
     """Parse a large table of rows alike, return None for any other; `first` is the first row."""
     import pandas as pd
 
@@ -468,9 +484,4 @@ def _block(body: bytes, layout: _Layout, first: list[str], name: str) -> _Parsed
     for i in text:
         columns[i] = words(map(str.strip, map(cell_text, columns[i])))
     _refuse_cut_end([line.decode() for line in last], body[-1:] not in b"\r\n", layout, name)
-
-    def place(row: int) -> int:
-        filled = (i for i, line in enumerate(_LINE_END.split(body)) if line.strip())
-        return next(islice(filled, row, None))
-
-    return columns, place, []
+    return columns
