@@ -33,7 +33,7 @@ _SMALLEST_VALUE = SMALLEST**0.5  # products and ratios of such numbers have repr
 _LONG_GAP = 5.0  # median steps; a longer gap is not interpolated
 _MOST_GAPS = 0.02  # fraction of the samples; with more gaps the record has uneven steps
 _SHOWN_GAPS = 3
-EVEN = 0.01  # fraction of a step by which samples may deviate from an even grid
+_EVEN = 0.01  # fraction of a step by which samples may deviate from an even grid
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -371,7 +371,7 @@ def is_even(time: FloatArray) -> bool:
     """Return whether every sample lies within 1 % of a step of an even grid."""
     grid = np.linspace(time[0], time[-1], time.size)
     step = (time[-1] - time[0]) / (time.size - 1)
-    return bool(np.abs(time - grid).max() <= EVEN * step)
+    return bool(np.abs(time - grid).max() <= _EVEN * step)
 
 
 def gaps(time: FloatArray) -> FloatArray:

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray, IntArray
-from dahl_ident.data.record import EVEN
+from dahl_ident.data.record import is_even
 from dahl_ident.errors import ExtractionError, argument
 
 FEWEST_CYCLES = 2  # needed to fit offset and drift in addition
@@ -165,12 +165,7 @@ class Samples:
     def block_size(self, highest_hz: float) -> int:
         """Return the number of samples per block; 1 if they are few per cycle, or uneven."""
         size = int(1.0 / (highest_hz * self.step * _MEANS_PER_CYCLE))
-        for start in range(0, self.time.size if size > 1 else 0, _SAMPLES_AT_ONCE):
-            part = self.time[start : start + _SAMPLES_AT_ONCE]
-            grid = self.time[0] + self.step * np.arange(start, start + part.size)
-            if np.abs(part - grid).max() > EVEN * self.step:
-                return 1
-        return max(size, 1)
+        return size if size > 1 and is_even(self.time) else 1
 
     def means(self, size: int) -> Samples:
         """Return means of blocks; samples after the last whole block are left out."""
