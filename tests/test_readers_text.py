@@ -500,3 +500,18 @@ def test_small_and_large_tables_are_read_alike(tmp_path):
     np.testing.assert_array_equal(a.amplitude, np.asarray(b.amplitude)[:20])
     np.testing.assert_array_equal(a.frequency_hz, b.frequency_hz[:20])
     np.testing.assert_array_equal(a.controlled, b.controlled[:20])
+
+
+@pytest.mark.parametrize("above", ["", "# a pause\n", "\n"])
+@pytest.mark.parametrize("below", ["", "End of data\n", "Mean,0.1,0.2\n", ",,\n", "# the end\n"])
+def test_large_tables_with_words_among_them(tmp_path, above, below):
+    rows = [f"12:00:{i // 100:02}.{i % 100:02},{i % 7}.5,{i % 5}\n" for i in range(5000)]
+    text = "time,x [mm],F [N]\n" + "".join(rows[:4000]) + above + "".join(rows[4000:]) + below
+    record = read_record(written(tmp_path, text))
+    assert record.n == 5000
+    np.testing.assert_allclose(record.time, np.arange(5000) / 100.0, atol=1e-9)
+    np.testing.assert_allclose(record.displacement, (np.arange(5000) % 7 + 0.5) * 1e-3)
+    with pytest.raises(DataError, match=rf"line {4502 + bool(above)}, column 'x': 'two' is not a"):
+        read_record(
+            written(tmp_path, text.replace(rows[4500], rows[4500].replace(",6.5,", ",two,")))
+        )
