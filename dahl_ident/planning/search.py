@@ -27,7 +27,6 @@ _HELPS = 0.1  # more time is useless below this fraction of the gain by the squa
 _CLOSE = 0.985  # fraction of the plan's time in which the target is not reached any more
 _APART = 2.0  # span of levels, in ranges that a fit takes as one amplitude: these are not exact
 _GRID_LEVELS = 10  # levels of the usual logarithmic plan with which the best one is compared
-_CORRECTIONS = 6  # of the repeats of motions, each with the whole information
 _FILLED = 0.999  # fraction of the target that corrected repeats aim at
 
 
@@ -182,21 +181,18 @@ class Search:
         q, candidates, levels = self.question, self.forecast.candidates, design.levels
         assert q.recorded is not None
         sums = [RepeatSums.of(q.knowledge, candidates.motions[k], q.recorded) for k in levels]
-        risen, best = False, design
-        for attempt in range(_CORRECTIONS):
-            rows, cycles = candidates.rows.copy(), best.cycles
+        cycles = design.cycles
+        while True:
+            rows = candidates.rows.copy()
             for k, motion_sums, repeats in zip(levels.tolist(), sums, cycles.tolist(), strict=True):
                 rows[:, k] = motion_sums.rows(int(repeats)) * q.knowledge.units
             self.forecast = replace(self.forecast, candidates=replace(candidates, rows=rows))
-            best = replace(best, ratio=self.ratio(best), seconds=self.bench.seconds(levels, cycles))
-            better = np.maximum(np.ceil(cycles * (best.ratio / _FILLED) ** 2), float(LEAST_CYCLES))
-            possible = self.bench.seconds(levels, better) <= min(q.limits.time, LONGEST)
-            done = (best.ratio <= 1.0 and risen) or bool((better == cycles).all())
-            if done or not (q.has_numbers and possible) or attempt == _CORRECTIONS - 1:
-                break
-            risen = risen or best.ratio > 1.0
-            best = replace(best, cycles=better)
-        return best
+            design = replace(design, cycles=cycles, seconds=self.bench.seconds(levels, cycles))
+            design = replace(design, ratio=self.ratio(design))
+            cycles = np.maximum(np.ceil(cycles * (design.ratio / _FILLED) ** 2), cycles + 1.0)
+            possible = self.bench.seconds(levels, cycles) <= min(q.limits.time, LONGEST)
+            if not (q.has_numbers and possible) or design.ratio <= 1.0:
+                return design
 
     def expected_after(self, time: float, *, grid: bool = False) -> dict[str, Expected]:
         """Return what the best plan of a time, or a grid, determines; empty if it is too short."""
