@@ -181,17 +181,18 @@ def _steady_part(
 
     `segment` is the part with the phase of a steady sine; `room` bounds its growth.
     """
-    more = 2.0 * np.pi / segment.omega * np.arange(1.0, _MOST_CYCLES_MORE + 1.0)
-    begin, end = time[part.start], time[part.stop - 1]
-    inner = _cycle_edges(segment)[1:-1]
-    before = np.searchsorted(time, np.concatenate([begin - more[::-1], [begin], inner]))
-    after = np.searchsorted(time, np.concatenate([[end], end + more]), side="right")
-    cuts = np.concatenate([before, after]).clip(room.start, room.stop)
+    cycle = 2.0 * np.pi / segment.omega
+    inner = np.searchsorted(time, _cycle_edges(segment)[1:-1]).tolist()
+    edges = [part.start, *inner, part.stop]
+    for _ in range(_MOST_CYCLES_MORE):
+        edges.insert(0, int(np.searchsorted(time, time[edges[0]] - cycle)))
+        edges.append(int(np.searchsorted(time, time[edges[-1] - 1] + cycle, side="right")))
+    cuts = np.clip(edges, room.start, room.stop)
     where = slice(int(cuts[0]), int(cuts[-1]))
     theta = np.asarray(segment.phase((time[where] - segment.centre) / segment.half_width))
     cycles = _EachCycle(theta, motion[where], cuts - cuts[0])
     phasor, variance = cycles.fits
-    first, last = begun, ended = more.size, phasor.size - more.size
+    first, last = begun, ended = _MOST_CYCLES_MORE, phasor.size - _MOST_CYCLES_MORE
     while (stray := cycles.strays(first, last)) is not None:
         early, late = stray[[first, last - 1]].tolist()
         if 2 * (last - first + 1) <= ended - begun or not (early or late):
