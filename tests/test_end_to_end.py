@@ -69,7 +69,8 @@ def test_clean():
 def test_microslip_says_that_f_max_is_only_bounded_below():
     fit = di.fit(table("microslip"), di.Dahl())
     assert not fit.trusted
-    assert "Only sigma is determined; not f_max" in fit.verdict
+    assert fit.verdict.startswith("Not determined.")
+    assert "Only sigma is determined; not f_max." in fit.verdict
     assert "no amplitude up to 6.7e-06 m reaches slip: drive above that" in fit.verdict
     assert_recovered(fit, truth("microslip"), "f_max", "sigma")
     assert_posterior_holds(fit, truth("microslip"), "f_max", "sigma")
@@ -161,6 +162,7 @@ def test_limits_in_the_verdict_are_those_at_the_parameters():
     limit = f"at least {fit.conf_interval()['f_max'][1].lower:.3g} N"
     assert fit.conf_interval("profile")["f_max"][1].lower > fit.conf_interval()["f_max"][1].lower
     assert f"f_max: {limit} (95.45 %), not determined" in fit.verdict
+    assert limit in fit.fit_report()
 
 
 def test_combinations_that_are_determined_have_the_uncertainty_of_their_budget():

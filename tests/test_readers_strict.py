@@ -65,12 +65,6 @@ class TestSecondHeaders:
         with pytest.raises(DataError, match=r"line 2 is a row of numbers like those from .*line 7"):
             read_frequency_response(place(tmp_path, "t.csv", text))
 
-    def test_in_a_comment(self, tmp_path):
-        lines = csv(COLUMNS).splitlines()
-        lines.insert(20, "# time [s],x [mm],F [N]")
-        with pytest.raises(DataError, match=r"line 21: .* names the columns again"):
-            read_record(place(tmp_path, "run.csv", "\n".join(lines)), **MAP)
-
     @pytest.mark.parametrize("line", [
         "time [s],x [mm],F [N]", "time [s],F [N],x [m]", "# time [s],x [mm],F [N]", "[s],[mm],[N]",
         "time (s),x (mm),F (N)",

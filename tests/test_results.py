@@ -236,13 +236,6 @@ class TestReport:
         upper = result.conf_interval(levels=0.95)["f_max"][0].upper
         assert upper == result.conf_interval(levels=(0.95,))["f_max"][0].upper
 
-    def test_what_is_not_to_be_trusted_says_why(self, microslip):
-        assert not microslip.trusted
-        assert microslip.verdict.startswith("Not determined.")
-        assert "Only sigma is determined; not f_max." in microslip.verdict
-        assert "drive above that" in microslip.verdict
-        assert "at least" in microslip.fit_report()
-
     def test_a_wrong_model_is_compared_with_others(self):
         wrong = fit(table(model=FRICTION + di.Spring(1.0)), di.Dahl())
         assert not wrong.trusted
