@@ -33,6 +33,12 @@ NEAR = {"f_max": (0.099, 0.101), "sigma": (29.7, 30.3)}
 KNEE = {"displacement": (0.1 * X_C, 10.0 * X_C), "frequency_hz": 5.0}
 
 
+def planned(model=LINEAR, time=None, *, limits=KNEE, **changes):
+    """Return a plan about the knee of friction known within 1 %, with 1 % of noise."""
+    limits = limits if time is None else {**limits, "time": time}
+    return di.plan(model, **{"ranges": NEAR, "noise": 0.01, "limits": limits, **changes})
+
+
 def _objective(seed, K, P, *, targets=0, scatter=0.0, draws=3):
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((draws, K, 2, P)) * rng.lognormal(0.0, 1.0, (1, K, 1, 1))
@@ -123,9 +129,9 @@ class TestModelError:
         assert own == pytest.approx(errors.state.K[:2, :2], rel=0.02)
 
     def test_levels_are_spread_by_the_model_error(self):
-        fit, limits = self._fit(), {**KNEE, "time": 60}
-        plan = di.plan(fit, limits=limits, target="response", candidates=25)
-        alone = di.plan(LINEAR, ranges=NEAR, noise=0.002, limits=limits, candidates=25)
+        fit = self._fit()
+        plan = di.plan(fit, limits={**KNEE, "time": 60}, target="response", candidates=25)
+        alone = planned(time=60, noise=0.002, candidates=25)
         assert len(plan.steps) > len(alone.steps) + 1
         assert "the model errs as the earlier data show" in str(plan)
         told = plan.expected["f_max"]
@@ -135,10 +141,7 @@ class TestModelError:
         assert told.after > 2.0 * alone.expected["f_max"].after
 
     def test_time_that_does_not_help_is_not_spent(self):
-        plan = di.plan(
-            LINEAR, ranges=NEAR, limits=KNEE, noise=0.01, scatter=0.02, runs=1,
-            target={"f_max": 0.01}, draws=20, candidates=30,
-        )  # fmt: skip
+        plan = planned(scatter=0.02, runs=1, target={"f_max": 0.01}, draws=20, candidates=30)
         assert not plan.reached
         assert plan.seconds < 200.0
 
@@ -191,7 +194,7 @@ def _brute_force(objective, bench, time, most):
 
 class TestPlan:
     def test_prediction_is_the_covariance_of_the_fit(self):
-        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 30}, noise=0.02)
+        plan = planned(time=30, noise=0.02)
         errors = _errors(plan, LINEAR.with_values(TRUTH), 0.02, 200)
         achieved = errors.std(axis=0)
         predicted = [plan.expected[name].after for name in ("f_max", "sigma")]
@@ -199,7 +202,7 @@ class TestPlan:
         assert achieved == pytest.approx(predicted, rel=0.15)
 
     def test_it_beats_a_logarithmic_grid(self):
-        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 25}, noise=0.02, target="f_max")
+        plan = planned(time=25, noise=0.02, target="f_max")
         even = plan.search.expected_after(25.0, grid=True)
         assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
 
@@ -223,8 +226,8 @@ class TestPlan:
     @pytest.mark.parametrize("known", [False, pytest.param(True, marks=pytest.mark.long)])
     def test_its_data_alone_can_be_used(self, known):
         """One amplitude, or two levels without a covariance, cannot show a wrong model."""
-        limits = {"displacement": (1e-4, 9.0 * X_C), "frequency_hz": 5.0, "time": 60.0}
-        plan = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max", draws=20)
+        limits = {"displacement": (1e-4, 9.0 * X_C), "frequency_hz": 5.0}
+        plan = planned(time=60.0, limits=limits, target="f_max", draws=20)
         usable = [
             di.fit(_measured(plan, 0.01, seed, known=known), LINEAR).status.value
             in ("trusted", "approximate")
@@ -251,13 +254,10 @@ class TestPlan:
 
     def test_a_target_is_reached_in_the_least_time(self):
         target = {"f_max": 0.004, "f_max/sigma": 0.006}
-        common: dict[str, Any] = {"ranges": NEAR, "noise": 0.02, "draws": 20}
-        plan = di.plan(LINEAR, limits=KNEE, target=target, **common)
+        plan = planned(target=target, noise=0.02, draws=20)
         assert plan.reached
         assert all(plan.expected[name].after <= u for name, u in target.items())
-        less = di.plan(
-            LINEAR, limits={**KNEE, "time": 0.93 * plan.seconds}, target=target, **common
-        )
+        less = planned(time=0.93 * plan.seconds, target=target, noise=0.02, draws=20)
         assert not less.reached
         assert less.seconds <= 0.93 * plan.seconds
 
@@ -272,10 +272,7 @@ class TestPlan:
         assert plan.seconds < 5.0
 
     def test_a_plan_takes_at_most_a_month(self):
-        plan = di.plan(
-            LINEAR, ranges=NEAR, limits=KNEE, noise=0.02, target={"f_max": 1e-9}, draws=10,
-            candidates=20,
-        )  # fmt: skip
+        plan = planned(noise=0.02, target={"f_max": 1e-9}, draws=10, candidates=20)
         assert not plan.reached
         assert plan.seconds == pytest.approx(30.0 * 86400.0, rel=1e-3)
         assert "no plan takes more than 30 days" in str(plan)
@@ -296,7 +293,7 @@ class TestPlan:
         fit = di.fit(FrequencyResponse(np.ones(12), clean * noise, A), LINEAR)
         target = {"f_max": 0.005, "sigma": 0.005}
         after = di.plan(fit, limits=KNEE, target=target, noise=0.02)
-        before = di.plan(LINEAR, ranges=NEAR, limits=KNEE, target=target, noise=0.02)
+        before = planned(target=target, noise=0.02)
         assert after.seconds < before.seconds
         assert after.expected["sigma"].before == pytest.approx(
             fit.errors.stderr["sigma"] / fit.errors.values["sigma"], rel=0.05
@@ -309,33 +306,26 @@ class TestPlan:
         assert max(step.level for step in after.steps) > 2.0 * X_C
 
     def test_every_limit_is_kept_and_the_one_that_prevents_is_named(self):
-        limits = {"displacement": (1e-4 * X_C, 1e-3 * X_C), "frequency_hz": (1, 5), "time": 600}
-        plan = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01)
+        limits = {"displacement": (1e-4 * X_C, 1e-3 * X_C), "frequency_hz": (1, 5)}
+        plan = planned(time=600, limits=limits)
         assert all(step.level <= 1.0001e-3 * X_C for step in plan.steps)
         (text,) = plan.undetermined
         assert text.startswith("f_max stays undetermined")
         assert "the limit of displacement prevents it" in text
-        fast = di.plan(
-            LINEAR, ranges=NEAR, noise=0.01, target="f_max",
-            limits={**KNEE, "speed": 0.05, "force": 0.08, "time": 60},
-        )  # fmt: skip
+        fast = planned(time=60, target="f_max", limits={**KNEE, "speed": 0.05, "force": 0.08})
         for step in fast.steps:
             assert 2.0 * np.pi * step.frequency_hz * step.level <= 0.0501
             N = abs(di.Dahl(F_MAX, SIGMA).describing_function(step.level))
             assert step.level * N <= 0.08 * 1.02
 
     def test_a_suspected_exponent_is_seen(self):
-        limits = {**KNEE, "time": 60}
-        plain = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max")
-        careful = di.plan(
-            LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max",
-            suspects={"alpha": 0.02},
-        )  # fmt: skip
+        plain = planned(time=60, target="f_max")
+        careful = planned(time=60, target="f_max", suspects={"alpha": 0.02})
         assert _exponent_error(careful) <= 0.02 < _exponent_error(plain)
         assert careful.reached
 
     def test_an_assumed_exponent_counts_as_in_a_fit(self):
-        plan = di.plan(di.Dahl(), ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.02)
+        plan = planned(di.Dahl(), time=60, noise=0.02)
         assert plan.expected["alpha"].before == pytest.approx(np.log(4.0) / np.sqrt(12.0))
         fit = di.fit(_measured(plan, 0.02, 1), di.Dahl())
         for name in ("f_max", "sigma"):
@@ -343,50 +333,38 @@ class TestPlan:
             assert found.stderr / found.value == pytest.approx(plan.expected[name].after, rel=0.25)
 
     def test_a_suspected_lack_of_symmetry_needs_even_harmonics(self):
-        plan = di.plan(
-            LINEAR, ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.01,
-            larger=di.Dahl(asymmetry=0.05),
-            suspects={"asymmetry": 0.02}, candidates=40, draws=20,
-        )  # fmt: skip
+        plan = planned(time=60, larger=di.Dahl(asymmetry=0.05), suspects={"asymmetry": 0.02},
+                       candidates=40, draws=20)  # fmt: skip
         assert plan.reached
 
     def test_parameters_of_either_sign_are_planned(self):
-        plan = di.plan(
-            di.BoucWen(), ranges={"sigma": (29.0, 31.0), "q": (200.0, 400.0), "p": (-100.0, 300.0)},
-            limits={**KNEE, "time": 60}, noise=0.01, draws=20, candidates=40,
-        )  # fmt: skip
+        ranges = {"sigma": (29.0, 31.0), "q": (200.0, 400.0), "p": (-100.0, 300.0)}
+        plan = planned(di.BoucWen(), time=60, ranges=ranges, draws=20, candidates=40)
         assert all(e.after < 0.25 for e in plan.expected.values())
 
     def test_a_suspected_gap_is_seen(self):
-        plan = di.plan(
-            LINEAR, ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.01, draws=20,
-            larger=di.Backlash(di.Dahl(alpha=1.0), gap=0.5 * X_C), suspects={"gap": 0.02},
-            candidates=40,
-        )  # fmt: skip
+        larger = di.Backlash(di.Dahl(alpha=1.0), gap=0.5 * X_C)
+        plan = planned(time=60, draws=20, larger=larger, suspects={"gap": 0.02}, candidates=40)
         assert plan.reached
         assert sum(step.level > 0.25 * X_C for step in plan.steps) > 1
 
     def test_scatter_asks_for_more_runs(self):
-        limits = {**KNEE, "time": 300}
-        one = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="sigma")
-        many = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="sigma", scatter=0.02)
+        one = planned(time=300, target="sigma")
+        many = planned(time=300, target="sigma", scatter=0.02)
         assert (one.runs, many.runs > 3) == (1, True)
         assert many.expected["sigma"].scatter_share > 0.5
         assert many.seconds <= 300.0
 
     def test_least_time_with_scatter_takes_as_few_runs_as_needed(self):
         # 2 % between runs leaves 1 % only with more than four
-        plan = di.plan(
-            LINEAR, ranges=NEAR, limits={**KNEE, "time": 3000}, noise=0.01, scatter=0.02,
-            between_runs=60.0, target={"f_max": 0.01}, draws=10, candidates=30,
-        )  # fmt: skip
+        plan = planned(time=3000, scatter=0.02, between_runs=60.0, target={"f_max": 0.01}, draws=10,
+                       candidates=30)  # fmt: skip
         assert (plan.reached, plan.runs) == (True, 5)
         assert plan.seconds < 320.0
 
     def test_an_expanded_uncertainty_is_wanted_by_name(self):
-        common: dict[str, Any] = {"ranges": NEAR, "limits": KNEE, "noise": 0.02, "draws": 20}
-        standard = di.plan(LINEAR, target={"f_max": 0.004}, **common)
-        expanded = di.plan(LINEAR, target={"U(f_max)": 0.008}, **common)
+        standard = planned(target={"f_max": 0.004}, noise=0.02, draws=20)
+        expanded = planned(target={"U(f_max)": 0.008}, noise=0.02, draws=20)
         # k = 2.0000 at 95.45 % of a normal distribution
         assert expanded.steps == standard.steps
         told = expanded.expected
@@ -394,10 +372,8 @@ class TestPlan:
         assert "U(...) expanded" in str(expanded)
 
     def test_few_runs_widen_an_expanded_uncertainty(self):
-        plan = di.plan(
-            LINEAR, ranges=NEAR, limits={**KNEE, "time": 600}, noise=0.001, scatter=0.02, runs=4,
-            target=["U(f_max)"], draws=20, candidates=40,
-        )  # fmt: skip
+        plan = planned(time=600, noise=0.001, scatter=0.02, runs=4, target=["U(f_max)"], draws=20,
+                       candidates=40)  # fmt: skip
         told = plan.expected
         # Student's t of three degrees of freedom: 3.31 at 95.45 %; scatter is nearly all
         assert told["U(f_max)"].after == pytest.approx(3.31 * told["f_max"].after, rel=0.02)
@@ -432,7 +408,7 @@ class TestPlan:
         assert all(np.isclose(single, step.level).any() for step in plan.steps)
 
     def test_the_waveform_holds_the_plan(self, tmp_path):
-        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 20}, noise=0.02)
+        plan = planned(time=20, noise=0.02)
         place = plan.write_waveform(tmp_path / "exciter.csv", 200.0)
         table = np.loadtxt(place, delimiter=",", skiprows=1)
         assert place.read_text().startswith("time [s],displacement [m],step,measured\n")
@@ -445,7 +421,7 @@ class TestPlan:
             plan.write_waveform(tmp_path / "coarse.csv", 10.0)
 
     def test_text_picture_and_data(self, tmp_path):
-        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 20}, noise=0.02, draws=10)
+        plan = planned(time=20, noise=0.02, draws=10)
         assert f"{len(plan.steps)} levels in" in str(plan)
         assert plan.to_frame()["seconds"].sum() == pytest.approx(plan.seconds)
         assert list(plan.budget().index) == ["f_max", "sigma"]
@@ -475,14 +451,8 @@ class TestPlan:
         ],
     )
     def test_bad_input_says_what_to_do(self, options, message):
-        good: dict[str, Any] = {
-            "ranges": NEAR,
-            "limits": {**KNEE, "time": 30},
-            "noise": 0.01,
-            "draws": 10,
-        }
         with pytest.raises(ValidationError, match=message.replace("+", r"\+")):
-            di.plan(di.Dahl(), **{**good, **options})
+            planned(di.Dahl(), **{"limits": {**KNEE, "time": 30}, "draws": 10, **options})
 
 
 class TestProof:
