@@ -17,7 +17,7 @@ ln(A/length) whose steps divide those of the grid. Several lengths are multiples
 from __future__ import annotations
 
 from collections.abc import Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -209,6 +209,11 @@ class NodeCurves:
     edges: list[BoolArray]
     """Nodes at either end of each direction, (K,)."""
 
+    @property
+    def count(self) -> int:
+        """The number of nodes: one for an element without directions."""
+        return next((v.shape[-1] for v in self.values.values()), 1)
+
 
 def needs_loops(d: Directions) -> bool:
     """Return whether a loop has to be integrated for every node and row."""
@@ -283,6 +288,10 @@ def columns_of(
 
 def curves_at_nodes(d: Directions, view: StiffnessData, most: float) -> NodeCurves:
     """Return an element at the nodes of its grid, of which there are at most about `most`."""
+    if not d.nonlinear:
+        fixed, columns = columns_of(d, {}, view)
+        columns = [replace(c, curve=_at_one_node(c.curve, view)) for c in columns]
+        return NodeCurves({}, columns, None if fixed is None else _at_one_node(fixed, view), [])
     if d.lengths:
         return _tabulated_curves(d, view, most)
     most = min(most, _MOST_OF_ONE)
@@ -316,6 +325,10 @@ def curves_at_nodes(d: Directions, view: StiffnessData, most: float) -> NodeCurv
         values[d.reference.name] = np.ones(index.shape[1])
     edges = [i == end for i, n in zip(index, counts, strict=True) if n > 1 for end in (0, n - 1)]
     return NodeCurves(values, columns, known_part, edges[: 2 * len(lengths)])
+
+
+def _at_one_node(curve: ComplexArray, view: StiffnessData) -> ComplexArray:
+    return np.broadcast_to(curve, view.stiffness.shape)[..., None, :]
 
 
 def _possible(

@@ -25,9 +25,7 @@ import numpy as np
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, IntArray, interleaved
 from dahl_ident.fitting.directions import (
     LARGEST_STIFFNESS,
-    LinearPart,
     NodeCurves,
-    columns_of,
     curves_at_nodes,
     directions,
     needs_loops,
@@ -137,11 +135,10 @@ class _Grid:
 
     problem: TableProblem
     curves: list[NodeCurves]
-    nodes: IntArray  # (C, elements with more than one node)
+    nodes: IntArray  # (C, elements)
     shape: tuple[int, ...]
-    target: ComplexArray  # weighted, (..., n)
-    weights: FloatArray  # (..., n)
-    common: list[LinearPart]  # the same at every node, curves of shape (..., n)
+    target: ComplexArray  # weighted, (..., 1, n)
+    weights: FloatArray  # (..., 1, n)
     mixed: bool  # nodes of several directions are in one axis, so neighbours need not be near
 
     def solved(self) -> tuple[FloatArray, FloatArray]:
@@ -149,40 +146,27 @@ class _Grid:
 
         A column that may vanish is left out where its coefficient would be negative.
         """
-        target, common, columns = self._system()
-        parts = [column for curves in self.curves for column in curves.columns]
-        positive = np.array([p.is_positive for p in parts], dtype=np.bool_)
-        may_vanish = np.array([p.may_vanish for p in parts], dtype=np.bool_)
+        target, columns, signs = self.target, list[FloatArray](), []
+        for index, curves in enumerate(self.curves):
+            chosen = self.nodes[:, index] if curves.values else slice(None)
+            if curves.known is not None:
+                target = target - curves.known[..., chosen, :] * self.weights
+            for part in curves.columns:
+                columns.append(interleaved(part.curve[..., chosen, :] * self.weights))
+                signs.append((bool(curves.values) and part.is_positive, part.may_vanish))
+        positive, may_vanish = np.array(signs, dtype=np.bool_).reshape(-1, 2).T
+        shape = np.broadcast_shapes(target.shape, (len(self.nodes), 1))
+        parts = interleaved(np.broadcast_to(target, shape))
         while True:
-            cost, coefficients = _solve_linear(target, common, columns)
-            separate = coefficients[..., len(common) :]
-            negative = (separate < 0.0) & positive & may_vanish
+            cost, coefficients = _solve_linear(parts, columns)
+            negative = (coefficients < 0.0) & positive & may_vanish
             if not negative.any():
                 break
             columns = [
                 np.where(negative[..., [i]], 0.0, column) for i, column in enumerate(columns)
             ]
-        allowed = ((separate > 0.0) | ~positive | may_vanish).all(axis=-1)
+        allowed = ((coefficients > 0.0) | ~positive | may_vanish).all(axis=-1)
         return np.where(allowed, cost, np.inf), coefficients
-
-    def _system(self) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
-        """Return the target, (..., C, 2 n), the common columns, and those of each node."""
-        target = self.target[..., None, :]
-        columns = []
-        for index, curves in enumerate(self.curves):
-            chosen = self.nodes[:, index]
-            columns += [
-                interleaved(column.curve[..., chosen, :] * self.weights[..., None, :])
-                for column in curves.columns
-            ]
-            if curves.known is not None:
-                target = target - curves.known[..., chosen, :] * self.weights[..., None, :]
-        shape = np.broadcast_shapes(target.shape, (len(self.nodes), 1))
-        common = [
-            interleaved(np.broadcast_to(c.curve * self.weights, self.target.shape))
-            for c in self.common
-        ]
-        return interleaved(np.broadcast_to(target, shape)), common, columns
 
     def of_tables(self, tables: IntArray) -> _Grid:
         """Return the grid of some tables of a batch, for use of `theta` only."""
@@ -201,16 +185,14 @@ class _Grid:
         else:
             chosen = np.take_along_axis(coefficients, combinations[..., None], axis=-2)
         by_name: dict[str, FloatArray] = {}
-        used = 0
-        for column in self.common:
-            _scaled(by_name, column, chosen[..., used])
-            used += 1
+        each = iter(np.moveaxis(chosen, -1, 0))
         for index, curves in enumerate(self.curves):
             node = self.nodes[combinations, index]
             by_name.update({name: _taken(v, node) for name, v in curves.values.items()})
-            for column in curves.columns:
-                _scaled(by_name, column, chosen[..., used])
-                used += 1
+            for column, coefficient in zip(curves.columns, each, strict=False):
+                size = np.abs(coefficient) if column.is_positive else coefficient
+                for p in column.parameters:
+                    by_name[p.name] = by_name.get(p.name, np.ones(())) * size
         theta = np.empty((*combinations.shape, len(self.problem.parameters)))
         for index, parameter in enumerate(self.problem.parameters):
             value = by_name.get(parameter.name, parameter.value)
@@ -221,14 +203,8 @@ class _Grid:
         return theta
 
 
-def _scaled(values: dict[str, FloatArray], column: LinearPart, coefficient: FloatArray) -> None:
-    size = np.abs(coefficient) if column.is_positive else coefficient
-    for p in column.parameters:
-        values[p.name] = values.get(p.name, np.ones(())) * size
-
-
 def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
-    elements = [directions(e) for e in problem.model.elements]
+    elements = sorted(map(directions, problem.model.elements), key=lambda d: bool(d.nonlinear))
     searched = [d for d in elements if d.nonlinear]
     rows = np.flatnonzero(view.harmonic <= _HIGHEST)
     rows = rows if rows.size else np.arange(view.harmonic.size)
@@ -242,89 +218,51 @@ def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
     if rows.size < view.harmonic.size:
         view = view.of_rows(rows)
     most = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
-    curves = [curves_at_nodes(d, view, most) for d in searched]
-    counts = [next(iter(c.values.values())).shape[-1] for c in curves]
-    nodes = np.indices(counts).reshape(len(counts), math.prod(counts)).T
-    fixed = np.zeros(view.stiffness.shape, dtype=np.complex128)
-    common: list[LinearPart] = []
-    for d in elements:
-        if d.nonlinear:
-            continue
-        known, columns = columns_of(d, {}, view)
-        fixed = fixed + (0.0 if known is None else known)
-        common += columns
+    curves = [curves_at_nodes(d, view, most) for d in elements]
+    counts = [c.count for c in curves]
     return _Grid(
         problem,
         curves,
-        nodes,
-        tuple(counts),
-        (view.stiffness - fixed) * view.weights,
-        view.weights,
-        common,
+        np.indices(counts).reshape(len(counts), math.prod(counts)).T,
+        tuple(counts[len(counts) - len(searched) :]),
+        (view.stiffness * view.weights)[..., None, :],
+        view.weights[..., None, :],
         any(len(d.nonlinear) > 1 for d in searched),
     )
 
 
-def _solve_linear(
-    target: FloatArray, common: list[FloatArray], separate: list[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
+def _solve_linear(target: FloatArray, columns: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return the least sum of squares of target - coefficients times columns, and the coefficients.
 
-    Columns in `common`, (..., 2 n), are the same at every node; they are projected out first,
-    because those in `separate`, (..., C, 2 n), can be nearly dependent on them.
+    By Gram-Schmidt's method, twice for accuracy, because columns can be nearly dependent.
     """
-    Q, R = _factors(common, target)
-    residual = _projected(target, Q)
-    columns = (
-        np.stack(np.broadcast_arrays(*separate), axis=-2)
-        if separate
-        else residual[..., None, :][..., :0, :]
-    )
     # nodes at which a hardening law overflows are not starts
-    usable = np.asarray((np.abs(columns) < LARGEST_STIFFNESS).all(axis=(-2, -1)))
-    if not usable.all():
-        columns = np.where(usable[..., None, None], columns, 0.0)
-    remaining = _projected(columns, Q[..., None, :, :])
-    norm = _lengths(remaining)
-    if common:
-        norm[norm < _DEPENDENT * _lengths(columns)] = 0.0
-    unit = remaining / np.where(norm > 0.0, norm, np.inf)[..., None]
-    gram = unit @ unit.swapaxes(-1, -2) + 1e-13 * np.eye(unit.shape[-2])
-    scaled = np.linalg.solve(gram, unit @ residual[..., None])
-    residual = residual - (scaled.swapaxes(-1, -2) @ unit)[..., 0, :]
-    coefficients = scaled[..., 0] / np.where(norm > 0.0, norm, np.inf)
-    cost = np.where(usable, np.einsum("...i,...i->...", residual, residual), np.inf)
-    if not common:
-        return cost, coefficients
-    explained = target - (coefficients[..., None, :] @ columns)[..., 0, :]
-    base = np.linalg.solve(R[..., None, :, :], (explained @ Q)[..., None])[..., 0]
-    return cost, np.concatenate([base, coefficients], axis=-1)
+    usable = [
+        (np.abs(column) < LARGEST_STIFFNESS).all(axis=-1, keepdims=True) for column in columns
+    ]
+    columns = [np.where(u, c, 0.0) for u, c in zip(usable, columns, strict=True)]
+    basis, norms, residual = list[FloatArray](), list[FloatArray](), target
+    for column in columns:
+        unit = column
+        for direction in 2 * basis:
+            unit = unit - _product(unit, direction) * direction
+        norm, size = (np.sqrt(_product(v, v)) for v in (unit, column))
+        norms.append(np.where(norm > _DEPENDENT * size, norm, np.inf))
+        basis.append(unit / norms[-1])
+        residual = residual - _product(residual, basis[-1]) * basis[-1]
+    coefficients, explained = np.empty((*residual.shape[:-1], len(columns))), target
+    for i, column in reversed(list(enumerate(columns))):
+        each = _product(explained, basis[i]) / norms[i]
+        coefficients[..., i] = each[..., 0]
+        explained = explained - each * column
+    cost = _product(residual, residual)
+    for is_usable in usable:
+        cost = np.where(is_usable, cost, np.inf)
+    return cost[..., 0], coefficients
 
 
-def _lengths(rows: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.einsum("...i,...i->...", rows, rows)))
-
-
-def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q, (..., 2 n, L), and R of the common columns; Q is 0 for dependent columns."""
-    lead, m = target.shape[:-2], target.shape[-1]
-    X = np.zeros((*lead, m, len(common)))
-    for index, column in enumerate(common):
-        X[..., index] = column
-    size = np.sqrt((X * X).sum(axis=-2))
-    size = np.where(size > 0.0, size, 1.0)
-    Q, R = np.linalg.qr(X / size[..., None, :])
-    diagonal = np.abs(np.diagonal(R, axis1=-2, axis2=-1))
-    dependent = diagonal < _DEPENDENT
-    R = R * size[..., None, :] + np.where(dependent, size, 0.0)[..., None, :] * np.eye(len(common))
-    return np.where(dependent[..., None, :], 0.0, Q), R
-
-
-def _projected(rows: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return rows, (..., C, 2 n), minus their part in the span of Q; twice, for accuracy."""
-    for _ in range(2 if Q.shape[-1] else 0):
-        rows = rows - (rows @ Q) @ Q.swapaxes(-1, -2)
-    return rows
+def _product(first: FloatArray, second: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("...i,...i->...", first, second)[..., None])
 
 
 def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]:
