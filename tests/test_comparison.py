@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 import dahl_ident as di
 from benchmarks.selection import choices
 from dahl_ident import compare_models, fit
-from dahl_ident.diagnostics.predictive_density import predictive_density
+from dahl_ident.diagnostics.held_out import predictive_density
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, table
 

@@ -70,7 +70,7 @@ class TestVerdicts:
         data = table(model=model, beta=(1e-2, 1e-1), noise=0.004)
         found = identifiability(fit(data, Dahl(alpha=1.0) + Spring(), throw=False))
         assert set(found.named(NOT)) == {"f_max", "sigma", "stiffness"}
-        combined = {c.expression: c for c in found.combinations}
+        combined = {c.name: c for c in found.combinations}
         assert set(combined) == {"sigma^2/f_max", "sigma + stiffness"}
         kappa, total = combined["sigma^2/f_max"], combined["sigma + stiffness"]
         assert abs(kappa.value - SIGMA**2 / F_MAX) < 4.0 * kappa.stderr
@@ -158,7 +158,7 @@ class TestVerdicts:
         result = fit(table(), Dahl(), sensors=Sensors(force_gain=None), throw=False)
         found = identifiability(result)
         (x_c,) = found.combinations
-        assert x_c.expression == "f_max/sigma"
+        assert x_c.name == "f_max/sigma"
         assert x_c.value == pytest.approx(X_C, rel=0.02)
         assert "calibrate the force channel, or give force_gain a prior" in str(found)
 
@@ -224,11 +224,8 @@ class TestVerdicts:
         data = table(model=FRICTION + Spring(30.0), beta=(1e-3, 1e-2), seed=seed)
         found = identifiability(fit(data, Dahl(alpha=1.0) + Spring(), throw=False))
         (seen,) = found.combinations
-        assert seen.expression == "the stiffness seen at 1.05e-05 m"
-        assert (
-            found.headline
-            == f"Only {seen.expression} is determined; not f_max, sigma and stiffness."
-        )
+        assert seen.name == "the stiffness seen at 1.05e-05 m"
+        assert found.headline == f"Only {seen.name} is determined; not f_max, sigma and stiffness."
         middle = np.sqrt(1e-3 * 1e-2) * X_C
         truth = FRICTION.describing_function(middle).real + 30.0
         assert seen.value == pytest.approx(truth, abs=3.0 * seen.stderr)

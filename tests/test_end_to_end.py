@@ -179,8 +179,8 @@ def test_combinations_that_are_determined_have_the_uncertainty_of_their_budget()
         for scatter in (-1, 0, 1)
     ]
     fit = di.fit(FrequencyResponse.concatenate(days), di.Dahl() + di.Spring(), throw=False)
-    (combination, *_) = (c for c in fit.identifiability.combinations if "+" in c.expression)
-    stated = fit.budget()[combination.expression]
+    (combination, *_) = (c for c in fit.identifiability.combinations if "+" in c.name)
+    stated = fit.budget()[combination.name]
     assert stated.u > 2.0 * stated.rows[-1].u
     assert (combination.value, combination.stderr) == (stated.value, stated.u)
     assert str(combination) in fit.verdict

@@ -11,7 +11,7 @@ import pytest
 import dahl_ident as di
 from benchmarks import planning
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics import error_sources, prediction_error
+from dahl_ident.diagnostics import bands, error_sources
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.planning import forecast
@@ -106,20 +106,18 @@ class TestModelError:
                       LINEAR)  # fmt: skip
 
     def test_departures_predict_what_kriging_does(self, monkeypatch):
-        monkeypatch.setattr(prediction_error, "_NEGLIGIBLE_SHAPES", 1e-9)
+        monkeypatch.setattr(bands, "_NEGLIGIBLE_SHAPES", 1e-9)
         monkeypatch.setattr(error_sources, "_SMOOTH", 1e-9)
         errors = self._fit().errors
         A, omega = np.geomspace(0.3, 4.0, 4) * X_C, np.full(4, 2.0 * np.pi)
         there = TableProblem(FrequencyResponse(omega / (2.0 * np.pi), np.ones(4), A), LINEAR)
         R = there.predict(errors.theta)
         slopes = there.prediction_jacobian(errors.theta) / R[:, None]
-        found = prediction_error.departures(errors, slopes, A, omega, R)
+        found = bands.departures(errors, slopes, A, omega, R)
         assert not found.assumed
         lever = np.concatenate([np.stack([slopes.real, slopes.imag], 1), found.columns], axis=-1)
         covariance = lever @ np.linalg.inv(found.information) @ lever.swapaxes(1, 2)
-        expected = prediction_error.prediction_error(
-            errors, slopes, A, omega, R, of_a_test=False
-        ).covariance
+        expected = bands.prediction_error(errors, slopes, A, omega, R, of_a_test=False).covariance
         # shapes of one process, cut off at different places
         assert np.trace(covariance, axis1=1, axis2=2) == pytest.approx(
             np.trace(expected, axis1=1, axis2=2), rel=0.02

@@ -2,19 +2,31 @@
 
 Combined standard uncertainty u, effective degrees of freedom (Welch and Satterthwaite), coverage
 factor k of Student's t for a confidence of 95.45 %, expanded uncertainty U = k u.
+
+It includes combinations of parameters that data can determine without determining each parameter:
+
+========================================  =====================================================
+combination                               determined in
+========================================  =====================================================
+products that an element names            microslip, an unknown gain: `Element.combinations`
+stiffness of friction + that of a spring  microslip: the stiffness seen at small amplitudes
+sums over two elements of one law         all slipping, or none: of force limits or stiffnesses
+stiffness seen, of friction and springs   springs that hide all of friction
+========================================  =====================================================
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.storage import library as data_library
-from dahl_ident.diagnostics.combinations import candidates, runaway
+from dahl_ident.diagnostics.bands import friction_and_slopes
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY, coverage_factor
 from dahl_ident.diagnostics.contributions import CHANNELS, TYPE_A, ErrorContributions, variances
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
@@ -30,14 +42,115 @@ from dahl_ident.diagnostics.formatting import (
     tabular,
     unit,
 )
-from dahl_ident.diagnostics.information import Information
+from dahl_ident.diagnostics.information import Information, parameter_values
+from dahl_ident.diagnostics.physics import is_spring
+from dahl_ident.elements import Parameter
+from dahl_ident.elements.parameter import STIFFNESS
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
+from dahl_ident.units import shown_unit
 
+_UNITS = ("N", "m", "s")
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 _VARIANCE_ROUNDING = 1e-12  # variance over the combined one that is a rounding error
 _SAME = 1e-6  # relative tolerance of equal limits
 _COLUMNS = ("source", "type", "u", "dof", "share", "k", "U")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A combination; `direction` are the derivatives of its logarithm with respect to theta."""
+
+    expression: str
+    unit: str
+    value: float
+    direction: FloatArray
+    members: frozenset[str]
+    is_sum: bool = False
+
+
+def candidates(optimum: Optimum) -> list[Candidate]:
+    """Return every combination of the optimum's free parameters."""
+    problem, names = optimum.problem, optimum.names
+    theta = dict(zip(names, problem.to_values(optimum.theta), strict=True))
+    slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
+    units = {p.name: p.unit for p in problem.parameters}
+    elements = problem.model.elements
+    friction = [e for e in elements if e.has_memory]
+    springs = [p for e in elements if is_spring(e) for p in e.parameters if p.free]
+    formed: list[Candidate] = []
+    for element in friction:
+        for combination in element.combinations():
+            powers = {element.parameter(n): power for n, power in combination.powers.items()}
+            if not all(p.free for p in powers):
+                continue
+            by_name = {p.name: power for p, power in powers.items()}
+            with np.errstate(over="ignore", under="ignore"):
+                value = float(np.exp(sum(c * np.log(theta[n]) for n, c in by_name.items())))
+            direction = np.array([by_name.get(name, 0.0) for name in names])
+            shown = shown_unit(_unit(powers), problem.data.motion)
+            text = element.named(combination.expression)
+            formed.append(Candidate(text, shown, value, direction, frozenset(by_name)))
+    scale = [{n: e.parameter(n) for n in e.scale_parameters} for e in friction]
+    stiff = (p for labels in scale for p in labels.values() if p.dimension == STIFFNESS)
+    pairs = [(p, spring) for p in stiff for spring in springs]
+    for (first_element, first), (second_element, second) in combinations(
+        zip(friction, scale, strict=True), 2
+    ):
+        if first_element.kind == second_element.kind:
+            pairs += [(first[label], second[label]) for label in first if label in second]
+    for both in ([p.name for p in two] for two in pairs if all(p.free for p in two)):
+        value = sum(theta[name] for name in both)
+        direction = np.array([slopes[n] / value if n in both else 0.0 for n in names])
+        text, members = " + ".join(both), frozenset(both)
+        formed.append(Candidate(text, units[both[0]], value, direction, members, is_sum=True))
+    return formed
+
+
+def stiffness_seen(optimum: Optimum) -> Candidate | None:
+    """Return the stiffness of friction and free springs together, in the middle of the amplitudes.
+
+    None without friction and a free spring. Stiffness data always determine it, so it is reported
+    only if they determine nothing else.
+    """
+    problem, names = optimum.problem, optimum.names
+    elements = problem.model.elements
+    springs = [p.name for e in elements if is_spring(e) for p in e.parameters]
+    friction = [
+        e.parameter(label).name for e in elements if e.has_memory for label in e.scale_parameters
+    ]
+    free = frozenset(springs) & frozenset(names)
+    if not free or not friction:
+        return None
+    A = float(np.exp(np.log(problem.stiffness_data.amplitude).mean()))
+    N, by = friction_and_slopes(problem, optimum.theta, np.array([A]))
+    values = parameter_values(optimum)
+    slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
+    of_springs = np.array([slopes[name] if name in free else 0.0 for name in names])
+    value = float(N[0].real) + sum(values[name] for name in springs)
+    motion = problem.data.motion
+    name = f"the stiffness seen at {A:.3g} {shown_unit('m', motion)}"
+    direction = (by[0].real + of_springs) / value
+    members = free | (frozenset(friction) & frozenset(names))
+    return Candidate(name, shown_unit("N/m", motion), value, direction, members)
+
+
+def runaway(optimum: Optimum) -> frozenset[str]:
+    """Return the names of parameters whose optimum is infinite, or zero for positive ones."""
+    positive, values = optimum.problem.space.positive, optimum.values
+    gone = ~np.isfinite(values) | (positive & (values == 0.0))
+    return frozenset(np.array(optimum.names)[gone].tolist())
+
+
+def _unit(powers: Mapping[Parameter, float]) -> str:
+    """Return the unit of a product, such as "N/m^2"."""
+    above, below = list[str](), list[str]()
+    for i, name in enumerate(_UNITS):
+        power = sum(exponent * p.dimension[i] for p, exponent in powers.items())
+        if power:
+            text = name if abs(power) == 1 else f"{name}^{abs(power):g}"
+            (above if power > 0 else below).append(text)
+    return "/".join([" ".join(above) or "1", *below]) if above or below else ""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from dahl_ident.diagnostics.physics import (
     weak_elements,
 )
 from dahl_ident.diagnostics.record_assessment import RecordAssessment
-from dahl_ident.diagnostics.record_misfit import REMEDY
+from dahl_ident.diagnostics.record_errors import REMEDY
 from dahl_ident.extraction.segment_quality import clipped_share, sensor_step
 from dahl_ident.fitting.losses import LOSSES
 from dahl_ident.units import si_unit
@@ -252,13 +252,9 @@ def _constraints(fit: Assessed) -> Iterator[Finding]:
     """Yield the constraints if the data contradict them."""
     cost = fit.constraint_cost
     if cost is not None and cost.p_value <= _CHANCE:
+        known = {"noise_known": bool(np.isinf(cost.dof)), "p_value": cost.p_value}
         yield described(
-            "constraint",
-            _NOT_DESCRIBED,
-            texts=tuple(cost.texts),
-            rise=cost.rise,
-            noise_known=bool(np.isinf(cost.dof)),
-            p_value=cost.p_value,
+            "constraint", _NOT_DESCRIBED, texts=tuple(cost.texts), rise=cost.rise, **known
         )
 
 
@@ -274,25 +270,14 @@ def _priors(fit: Assessed) -> Iterator[Finding]:
 def _exponents(fit: Assessed) -> Iterator[Finding]:
     """Yield every assumed or stated exponent that the data contradict."""
     for exponent in fit.contradicted_exponents:
+        name, value, u = exponent.name, exponent.indicated, exponent.stderr
         if exponent.range is None:
-            yield described(
-                "stated_exponent",
-                _NOT_DESCRIBED,
-                name=exponent.name,
-                held=exponent.fixed,
-                wanted=with_unit(exponent.indicated, exponent.stderr, ""),
-            )
+            values = {"held": exponent.fixed, "wanted": with_unit(value, u, "")}
+            yield described("stated_exponent", _NOT_DESCRIBED, name=name, **values)
         else:
             low, high = exponent.range
-            yield described(
-                "beyond_range",
-                _APPROXIMATE,
-                name=exponent.name,
-                value=exponent.indicated,
-                stderr=exponent.stderr,
-                low=low,
-                high=high,
-            )
+            values = {"value": value, "stderr": u, "low": low, "high": high}
+            yield described("beyond_range", _APPROXIMATE, name=name, **values)
 
 
 @_of_tables
@@ -346,11 +331,6 @@ def robust_values(
     robust = dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
     by_noise = dict(zip(problem.names, std.tolist(), strict=True))
     return robust, by_noise
-
-
-@_of_tables
-def _steady(fit: TableAssessment) -> Iterator[Finding]:
-    yield from steady_findings(fit.optimum, fit.model)
 
 
 @_of_records
@@ -428,16 +408,9 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
         if p.prior is None or p.free:
             continue
         if counted and p.name in fit.assumed:
-            ranges.append(
-                {
-                    "name": p.name,
-                    "low": p.prior[0],
-                    "high": p.prior[1],
-                    "unit": p.unit,
-                    "value": values[p.name],
-                    "stderr": stderr[p.name],
-                }
-            )
+            low, high = p.prior
+            known = {"value": values[p.name], "stderr": stderr[p.name], "unit": p.unit}
+            ranges.append({"name": p.name, "low": low, "high": high, **known})
         elif p.value is not None:
             stated[p.name] = p.value
     cost = fit.constraint_cost
@@ -467,7 +440,7 @@ CHECKS: tuple[_Check, ...] = (
     _misfit_of_table,
     _misfit_of_records,
     _weak_elements,
-    _steady,
+    _of_tables(lambda fit: steady_findings(fit.optimum, fit.model)),
     _clipped,
     _delay,
     _size_of_residuals,

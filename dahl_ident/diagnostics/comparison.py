@@ -3,7 +3,7 @@
 Candidates follow from the misfit of the fit: a mean force suggests two limits, a response that
 changes with frequency a damper, a force that falls with it LuGre's law, any other misfit another
 shape of loop. Each is judged by how it predicts tests that it was not fitted to
-(:mod:`dahl_ident.diagnostics.predictive_density`). Of those whose density is within one standard
+(:mod:`dahl_ident.diagnostics.held_out`). Of those whose density is within one standard
 error of the highest, the simplest is the best. The model fitted stays the best unless another's
 density is higher by more than chance explains among many candidates. AIC and BIC are not used: with
 harmonics whose covariance is tiny they prefer a model that fits the fundamental badly. If no model
@@ -26,6 +26,7 @@ from scipy import special
 from dahl_ident.arrays import TINY, FloatArray
 from dahl_ident.diagnostics.error_model import error_model
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
+from dahl_ident.diagnostics.held_out import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.information import Information, parameter_values, values_at
 from dahl_ident.diagnostics.physics import (
     OF_FRICTION,
@@ -33,7 +34,6 @@ from dahl_ident.diagnostics.physics import (
     is_spring,
     negative_parameters,
 )
-from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.record_channels import RELATIVE_STEP
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.verdicts import NOT_IDENTIFIED_ABOVE

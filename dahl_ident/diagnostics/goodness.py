@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray, quotient
+from dahl_ident.arrays import quotient
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import p_text, with_unit
@@ -346,7 +346,11 @@ def _within_runs(errors: ErrorModel) -> Goodness | None:
         if source.name == RUNS and v > 0.0
     }
     least = _WORTH_NAMING * max(scatter.values())
-    parts = [f"{n} by {_relative(n, s)}" for n, s in scatter.items() if s >= least]
+    parts = [
+        f"{name} by {f'{np.degrees(s):.2g} deg' if name == 'phase' else percent(s)}"
+        for name, s in scatter.items()
+        if s >= least
+    ]
     text = f"the runs differ ({', '.join(parts)})"
     return replace(tested, tests=(ResidualTest("runs differ", p, text, scatter), *tested.tests))
 
@@ -400,10 +404,6 @@ def _smooth(errors: ErrorModel | None) -> ResidualTest | None:
         f"({percent(size / errors.structure)})"
     )
     return ResidualTest("smooth", errors.structure_by_chance, text, {"size": size})
-
-
-def _relative(name: str, size: float) -> str:
-    return f"{np.degrees(size):.2g} deg" if name == "phase" else percent(size)
 
 
 def _untested(optimum: Optimum) -> bool:
@@ -463,7 +463,10 @@ def _exponent(
     (alpha,) = exponents
     if alpha.free or alpha.value is None:
         return None
-    change = _change_with_exponent(optimum, alpha.name)
+    freed = optimum.problem.like(free=[alpha.name])  # sensors and drive included
+    theta = optimum.theta_in(freed)
+    by_alpha = freed.prediction_jacobian(theta)[:, freed.names.index(alpha.name)]
+    change = quotient(by_alpha, freed.predict(theta))
     slope, error = space.coefficient(change)
     p = space.p_value(change[None])
     if not error < 1.0 or np.isnan(p):  # with a larger error the exponent is unknown
@@ -480,14 +483,6 @@ def _exponent(
     )
     numbers = {"fixed": alpha.value, "indicated": indicated, "stderr": u, "widened": widened}
     return ResidualTest("exponent", p, text, numbers, alpha.name)
-
-
-def _change_with_exponent(optimum: Optimum, name: str) -> ComplexArray:
-    """Return the relative change of the response with ln alpha, sensors and drive included."""
-    freed = optimum.problem.like(free=[name])
-    theta = optimum.theta_in(freed)
-    slope = freed.prediction_jacobian(theta)[:, freed.names.index(name)]
-    return quotient(slope, freed.predict(theta))
 
 
 def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ResidualTest | None:

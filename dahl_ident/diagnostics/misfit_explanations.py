@@ -129,16 +129,13 @@ def _most_deviant(
 
 def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
     """Return the fall of the sum of squares without each point: r' (I - H)^-1 r."""
-    pairs = r.reshape(-1, 2)
+    pairs = r.reshape(-1, 2, 1)
     Q = lever.reshape(len(pairs), 2, -1)
-    first, second = Q[:, 0], Q[:, 1]
-    xx, yy = 1.0 - (first * first).sum(1), 1.0 - (second * second).sum(1)
-    xy = -(first * second).sum(1)
-    determinant = xx * yy - xy**2
-    x, y = pairs.T
-    form = yy * x**2 - 2.0 * xy * x * y + xx * y**2
-    fixed = determinant < 1e-8  # a point that alone determines a parameter
-    return np.where(fixed, 0.0, form / np.where(fixed, 1.0, determinant))
+    left = np.eye(2) - Q @ Q.swapaxes(1, 2)
+    fixed = np.linalg.det(left) < 1e-8  # a point that alone determines a parameter
+    left[fixed] = np.eye(2)
+    squares = np.sum(pairs * np.linalg.solve(left, pairs), axis=(1, 2))
+    return np.where(fixed, 0.0, squares)
 
 
 def flagged_rows(data: FrequencyResponse) -> tuple[str, ...]:

@@ -95,21 +95,13 @@ def with_noisier_displacement(fit: LinearFit) -> list[Waves]:
     if problem.output != "force":
         return []
     if problem.displacement_noise:
-        low, high = (
-            problem.without_noise(problem.displacement_noise, lead).outputs(fit.values)
-            for lead in LEADS[::2]
-        )
-        return [[problem.filtered(0.5 * (b - a)) for a, b in zip(low, high, strict=True)]]
+        ends = (problem.without_noise(problem.displacement_noise, lead) for lead in LEADS[::2])
+        low, high = (fit.difference_to(end) for end in ends)
+        return [[0.5 * (b - a) for a, b in zip(low, high, strict=True)]]
 
     def drawn(noise: float) -> list[Waves]:
-        outputs = [problem.with_more_noise(noise, n).outputs(fit.values) for n in range(_DRAWS)]
-        return [
-            [
-                problem.filtered((b - a) / _DRAWS**0.5)
-                for a, b in zip(fit.outputs, noisy, strict=True)
-            ]
-            for noisy in outputs
-        ]
+        noisy = (problem.with_more_noise(noise, draw) for draw in range(_DRAWS))
+        return [[wave / _DRAWS**0.5 for wave in fit.difference_to(other)] for other in noisy]
 
     noise = problem.estimated_noise
     draws = drawn(noise)
@@ -155,7 +147,10 @@ def by_calibration(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
     stated = [r.drive_factor_uncertainty for r in problem.records]
     factor = max((float(u) for u in stated), default=0.0)
     if factor > 0.0 and (problem.output == "force" or problem.excitation == "force"):
-        yield FORCE, _squared(factor * _with_force(fit))
+        with_force = np.zeros(fit.values.size)
+        for i, p in enumerate(problem.free):
+            with_force[i] = factor * fit.values[i] * p.dimension[0]
+        yield FORCE, _squared(with_force)
 
 
 def _by_gain(fit: LinearFit, place: int) -> FloatArray:
@@ -170,14 +165,6 @@ def _by_gain(fit: LinearFit, place: int) -> FloatArray:
         slope = [(b - a) / (2.0 * RELATIVE_STEP) for a, b in zip(low, high, strict=True)]
         change = change + p.dimension[place] * fit.changed(slope)
     return change
-
-
-def _with_force(fit: LinearFit) -> FloatArray:
-    """Return the change of the model's parameters with ln of every force."""
-    scale = np.zeros(fit.values.size)
-    for i, parameter in enumerate(fit.problem.free):
-        scale[i] = fit.values[i] * parameter.dimension[0]
-    return scale
 
 
 def by_drive(fit: LinearFit) -> FloatArray | None:

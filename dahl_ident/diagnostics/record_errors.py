@@ -1,14 +1,27 @@
-"""Errors of a fit to records: noise, model error, drive, calibration; and their budget."""
+"""Errors of a fit to records: noise, model error, drive, calibration; and their budget.
+
+Residuals of a correct model are noise, white or not, which does not depend on the motion. Those of
+a wrong model are a function of the motion's state: the friction force, the velocity or the
+displacement. So functions of the state are fitted to the residuals together with the parameters,
+and compared with the remaining noise: slow noise has few effective samples, and may look like a
+function of the state by chance.
+
+The changes of the parameters by these functions are the model error: the misfit is assumed to be as
+large in the directions of the parameters, where the residuals cannot show it, as in others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
+from scipy import special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.contributions import (
     ALONG_MOTION,
     EXPONENT,
@@ -19,7 +32,7 @@ from dahl_ident.diagnostics.contributions import (
     satterthwaite,
     variances,
 )
-from dahl_ident.diagnostics.correlated_residuals import sandwich
+from dahl_ident.diagnostics.correlated_residuals import correlated, noise_in, sandwich
 from dahl_ident.diagnostics.record_channels import (
     DISPLACEMENT_GAIN,
     DRIVE,
@@ -30,19 +43,202 @@ from dahl_ident.diagnostics.record_channels import (
     motion_sources,
     with_noisier_displacement,
 )
-from dahl_ident.diagnostics.record_misfit import MotionMisfit, motion_misfit
 from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
     FixedExponent,
     LinearFit,
     between_records,
+    blocks_of,
     fixed_exponents,
 )
+from dahl_ident.elements import Friction
+from dahl_ident.elements.recursion import linear_recursion, stretches
+from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
+_FUNCTION_BY_CHANCE = 1e-3  # of all functions together; wrong laws are far more significant
+_SEEN = 0.01  # part of a function that the parameters do not explain, above which it counts
+_FRICTION_LEVELS = np.linspace(-1.0, 1.0, 7)  # of the friction force in the direction of motion
+_SPEEDS = 2.0 ** np.arange(1, 4)  # highest speed over the speeds of decaying functions
+_BLOCKS = 60  # of all records, between which the noise may differ: far more than functions
+_FORCE_STEP = 1e-3  # of the drive, for the motion's derivatives with respect to a force
+FRICTION, VELOCITY, DISPLACEMENT = "the friction force", "the velocity", "the displacement"
+REMEDY = {
+    FRICTION: ("", "fit another friction law"),
+    VELOCITY: ("damper", "fit a law that changes with the speed"),
+    DISPLACEMENT: ("spring", "look for a stiffness that is not linear"),
+}
+"""An element to add, if the model has none, and another remedy, by what the residuals follow."""
 _SLIGHT = 1e-6  # standard deviation along a direction, over the largest, that is rounding
 _SHORTENS = 0.5  # part of u: without a smaller source, intervals are at most 10 % too short
+
+
+@dataclass(frozen=True)
+class MotionMisfit:
+    """Dependence of the residuals on the motion's state that exceeds chance."""
+
+    covariance: FloatArray  # (P, P): of the estimate, due to this dependence
+    follows: str  # quantity that explains most of the residuals
+    share: float  # of their variance that it explains
+    functions: int  # number of functions from which the covariance was estimated
+
+
+def motion_misfit(
+    fit: LinearFit, other_motions: Collection[Sequence[FloatArray]]
+) -> MotionMisfit | None:
+    """Return the model error that the residuals show as functions of the motion's state.
+
+    Residuals that the delay explains, or changes of the outputs by `other_motions`, are not a model
+    error. None if chance explains the dependence.
+    """
+    problem, values, residuals = fit.problem, fit.values, fit.residuals
+    slopes = fit.exponent_slopes
+    assumed = [slopes[p.name] for p in problem.exponents if p.assumed and p.name in slopes]
+    freed = fit.with_freed(*assumed)
+    ends, count = np.cumsum([e.size for e in residuals])[:-1], values.size
+    J, e = np.concatenate(freed.jacobians), np.concatenate(residuals)
+    channels = [np.concatenate(changes) for changes in other_motions]
+    with suppress(FitError):  # no motion close to the estimate
+        channels.append(np.concatenate(fit.delay_slopes))
+    known = _basis(np.column_stack([J, *channels]))
+    e = e - known @ (known.T @ e)
+    waves = dict[str, FloatArray]()
+    try:
+        parts = [_functions(fit, number) for number in range(len(problem.records))]
+    except FitError:  # no motion close to the estimate
+        return None
+    for name in parts[0]:
+        wave = np.concatenate([problem.filtered(part[name]) for part in parts])
+        waves[name] = _basis(wave, _SEEN)
+    unexplained = {name: _part(B - known @ (known.T @ B), _SEEN) for name, B in waves.items()}
+    gain = freed.inverse[:count] @ J.T
+    starts = np.append(0, ends)
+    blocks = [starts[number] + rows for number, rows in blocks_of(residuals, _BLOCKS)]
+    covariance, significant = np.zeros((count, count)), dict[str, tuple[float, int]]()
+    for name, Q in unexplained.items():
+        remaining = e - Q @ (Q.T @ e)
+        if not (Q.shape[1] and remaining.any()):
+            continue
+        whole = np.column_stack([known, Q])
+        noise = noise_in(np.split(whole, ends), np.split(remaining, ends))
+        dof = max(_samples_of(noise, residuals) - whole.shape[1], 1.0)
+        pieces = zip(np.split(Q, ends), noise, strict=True)
+        by_noise = np.asarray(sum(q.T @ correlated(q, c) for q, c in pieces))
+        fitted = Q.T @ e
+        square = float(fitted @ np.linalg.solve(by_noise, fitted))
+        expected = Q.shape[1] * max(_between_blocks(Q, remaining, blocks, by_noise), 1.0)
+        chance = special.fdtrc(Q.shape[1], dof, square / expected)
+        if not chance < _FUNCTION_BY_CHANCE / len(unexplained):
+            continue
+        along = Q.T @ waves[name]
+        unit = float(np.trace(np.linalg.solve(by_noise, along @ along.T)))
+        moved = gain @ waves[name]
+        covariance += (square - expected) / unit * moved @ moved.T
+        significant[name] = float(fitted @ fitted) / float(e @ e), Q.shape[1]
+    if not significant:
+        return None
+    follows = max(significant, key=lambda name: significant[name][0])
+    return MotionMisfit(covariance, follows, *significant[follows])
+
+
+def _between_blocks(
+    Q: FloatArray, residuals: FloatArray, blocks: Sequence[IntArray], by_noise: FloatArray
+) -> float:
+    """Return the variance of the fitted coefficients, from blocks, over that `by_noise`.
+
+    The noise may vary along a record, for example between sticking and slipping. Each block's
+    residuals are those of a fit without it.
+    """
+    unit = np.eye(Q.shape[1])
+    scores = [np.linalg.pinv(unit - Q[b].T @ Q[b]) @ Q[b].T @ residuals[b] for b in blocks]
+    squares = [float(score @ np.linalg.solve(by_noise, score)) for score in scores]
+    return float(sum(squares) / Q.shape[1])
+
+
+def _samples_of(noise: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> float:
+    """Return the number of samples of white noise that would determine its variance as well."""
+    pairs = [(c, e.size) for c, e in zip(noise, residuals, strict=True)]
+    spread = sum(n * float(2.0 * c @ c - c[0] ** 2) for c, n in pairs)
+    return sum(n * float(c[0]) for c, n in pairs) ** 2 / spread
+
+
+def _basis(waves: FloatArray, least: float = 1e-9) -> FloatArray:
+    """Return an orthonormal basis of normalized columns, without directions below `least`."""
+    length = np.linalg.norm(waves, axis=0)
+    return _part(waves[:, length > 0.0] / length[length > 0.0], least)
+
+
+def _part(waves: FloatArray, least: float) -> FloatArray:
+    """Return an orthonormal basis of the directions that are not smaller than `least`."""
+    vectors, sizes, _ = np.linalg.svd(waves, full_matrices=False)
+    return np.asarray(vectors[:, sizes > least])
+
+
+def _functions(fit: LinearFit, number: int) -> dict[str, FloatArray]:
+    """Return the changes of a record's output by forces that depend on the state, (n, k) each."""
+    problem, values = fit.problem, fit.values
+    record = problem.records[number]
+    if problem.output == "force":
+        x, v, _ = problem.motions[number]
+        x = x if problem.paths is None else problem.paths[number]
+        return _forces(problem, values, x, v if v.size else np.gradient(x, record.time))
+    plain = fit.outputs[number]
+    step = _FORCE_STEP * float(problem.unit_sizes((1, 0, 0))[number])
+
+    def moved(force: FloatArray) -> FloatArray:
+        driven = problem.driven_more({number: step * force})
+        return driven.predict(values, number, derivatives=False).output - plain
+
+    forces = _forces(problem, values, *in_band(record, plain)[:2])
+    return {
+        name: np.column_stack(
+            [moved(wave / np.std(wave)) for wave in waves.T if np.std(wave) > 0.0]
+        )
+        for name, waves in forces.items()
+    }
+
+
+def _forces(
+    problem: RecordProblem, values: FloatArray, x: FloatArray, v: FloatArray
+) -> dict[str, FloatArray]:
+    """Return forces that depend on the state of a motion, (n, k), by what they depend on.
+
+    An error of the law's slope, a function of the force or of the speed, changes the friction
+    force, and the change decays over the characteristic displacement.
+    """
+    parts = stretches(x)
+    heading, farthest = parts.spread(parts.heading), float(parts.path.max()) or 1.0
+    friction, lengths = 0.0 * x, set[float]()
+    for element, at in problem.model.of(problem.full_values(values)):
+        if isinstance(element, Friction):
+            start: Any = np.zeros(len(element.starts)) if len(element.starts) > 1 else 0.0
+            friction = friction + np.asarray(element.force_history(at, x, v, start))
+            lengths |= {float(knee) for knee in element.knee([np.asarray(a) for a in at])}
+    if not friction.any():
+        friction = heading
+    lengths = {min(length, farthest) for length in lengths if length > 0.0} or {farthest}
+    ahead = heading * friction / (np.abs(friction).max() or 1.0)
+    speed, position = v / (np.abs(v).max() or 1.0), (x - x.mean()) / (np.ptp(x) or 1.0)
+    width = _FRICTION_LEVELS[1] - _FRICTION_LEVELS[0]
+    levels = np.maximum(1.0 - np.abs(ahead[:, None] - _FRICTION_LEVELS) / width, 0.0)
+    limits = ahead[:, None] * np.exp(-((speed[:, None] * _SPEEDS) ** 2))
+
+    def decaying(slopes: FloatArray) -> FloatArray:
+        steps = np.diff(x)
+        term = 0.5 * (slopes[1:] + slopes[:-1]) * steps[:, None]
+        zero = np.zeros(slopes.shape[1])
+        return np.column_stack(
+            [linear_recursion(np.exp(-np.abs(steps) / d), term, zero) for d in sorted(lengths)]
+        )
+
+    damping = np.column_stack([speed, speed * np.abs(speed), speed**3])
+    return {
+        FRICTION: decaying(levels),
+        VELOCITY: np.column_stack([damping, decaying(limits)]),
+        DISPLACEMENT: np.column_stack([position, position**2, position**3]),
+    }
 
 
 @dataclass(frozen=True)

@@ -80,27 +80,7 @@ def _undetermined(determined: Sequence[str], weak: Sequence[str], lost: Sequence
     return f"Only {_are(determined)} determined{weakly}; not {listed(lost)}."
 
 
-def _no_degrees_of_freedom(numbers: int, parameters: int, scale_known: bool) -> str:
-    judged = "the model" if scale_known else "noise and model"
-    return (
-        f"{numbers} numbers and {counted(parameters, 'parameter')} leave no degree of freedom to "
-        f"judge {judged}: measure more points."
-    )
-
-
 # Described?
-
-
-def _misfit(rms: float, objections: Sequence[str], counted: bool) -> str:
-    if counted:
-        return (
-            f"The stated uncertainties include a misfit of {percent(rms)} rms: "
-            f"{departures(objections)}."
-        )
-    return (
-        f"The model does not describe these data ({percent(rms)} rms misfit): "
-        f"{departures(objections)}."
-    )
 
 
 def _noise(rms: float, hints: Sequence[str], scatter: str) -> str:
@@ -123,73 +103,6 @@ def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> 
         f"{named} the model ({percent(rms)} rms misfit): without {them} {left}. The fit includes "
         f"{these}: check {them}, or fit with {argument('loss', 'huber')}, which down-weights "
         f"{them}."
-    )
-
-
-def _suspicious(names: Sequence[str], neighbours: str) -> str:
-    rows = joined(names, _MOST_ROWS)
-    if neighbours:
-        return (
-            f"Suspicious rows: {rows}; without them the model describes the data, but "
-            f"{neighbours}: check them, or the model is wrong there."
-        )
-    return f"Suspicious rows: {rows}; check them (a robust loss down-weights these rows)."
-
-
-def _flagged(points: Sequence[str], every: bool) -> str:
-    which = joined(points, 1)
-    if every:
-        return f"The extraction flagged every point fitted ({which}): measure them again."
-    return (
-        f"The extraction flagged {len(points)} of the points fitted ({which}): measure them again, "
-        "or select the good ones."
-    )
-
-
-def _held_out(tests: int, available: int, gains: int, phases: int, rows: int, width: float) -> str:
-    of = "" if tests == available else f" of {available}"
-    return (
-        f"Without each of {tests}{of} tests in turn, {gains} of {rows} held-out gains and {phases} "
-        f"of {rows} phases of fundamentals are inside their {_LEVEL} bands (half width "
-        f"{percent(width)})."
-    )
-
-
-def _constraint(texts: Sequence[str], rise: float, noise_known: bool, p_value: float) -> str:
-    noise = "known" if noise_known else "estimated"
-    return (
-        f"The data contradict the constraint {listed(texts)} ({p_text(p_value)}): it raises the "
-        f"sum of squares by {rise:.3g} times the {noise} variance of the noise. Check the "
-        "constraint, or the model."
-    )
-
-
-def _prior(name: str, value: float, mean: float, std: float) -> str:
-    return (
-        f"The data contradict the prior of {name}: {value:.4g} against {mean:g} ± {std:g}, "
-        f"{abs(value - mean) / std:.1f} standard deviations: check the calibration, or the model."
-    )
-
-
-def _moved(names: Sequence[str], rows: Sequence[str]) -> str:
-    which = "the suspicious rows" if rows else "the rows with the largest residuals"
-    return (
-        f"A robust fit moves {listed(names)} by more than one standard uncertainty: check {which}, "
-        f"or fit with {argument('loss', 'huber')}."
-    )
-
-
-def _negative(name: str, value: float, stderr: float, unit: str, instead: str) -> str:
-    return (
-        f"{name} is negative ({with_unit(value, stderr or None, unit)}), as of no device: it "
-        f"stands for what the model lacks, and is not {instead}."
-    )
-
-
-def _slight(name: str, value: float, stderr: float, unit: str, share: float, misfit: float) -> str:
-    return (
-        f"{name} = {with_unit(value, stderr, unit)} rests on {percent(share)} rms of the force, "
-        f"less than the model misses ({percent(misfit)}): give it, or leave it out."
     )
 
 
@@ -224,15 +137,6 @@ def _jump(places: Sequence[tuple[float, float, float]], unit: str) -> str:
     return (
         f"The response jumps: {listed(there)} the plant has more than one stable motion; each row "
         "there is fitted on the branch that the order of the rows follows."
-    )
-
-
-def _unstable_rows(rows: Sequence[str]) -> str:
-    one = len(rows) == 1
-    return (
-        f"The predicted motion is not stable at {listed(rows)}: the device moves otherwise there, "
-        f"and the steady response cannot describe {'it' if one else 'them'}; leave "
-        f"{'this row' if one else 'these rows'} out."
     )
 
 
@@ -286,10 +190,20 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
         f"{f', not determined, {why}' if why else ''}."
     ),
     "solver": "{message}",
-    "no_degrees_of_freedom": _no_degrees_of_freedom,
+    "no_degrees_of_freedom": lambda numbers, parameters, scale_known: (
+        f"{numbers} numbers and {counted(parameters, 'parameter')} leave no degree of freedom to "
+        f"judge {'the model' if scale_known else 'noise and model'}: measure more points."
+    ),
     "sign": "{convention}. Do not use the numbers of this fit.",
     "rows_apart": _rows_apart,
-    "misfit": _misfit,
+    "misfit": lambda rms, objections, counted: (
+        (
+            f"The stated uncertainties include a misfit of {percent(rms)} rms: "
+            if counted
+            else f"The model does not describe these data ({percent(rms)} rms misfit): "
+        )
+        + f"{departures(objections)}."
+    ),
     "large_misfit": "The misfit is {rms:percent} rms, more than half of the response: no "
     "uncertainty can be stated.",
     "too_few_points": lambda rms, dof: (
@@ -300,30 +214,67 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "one_amplitude": "One amplitude gives no more numbers than friction has parameters, so any "
     "model fits ({rms:percent} rms misfit): measure at other amplitudes as well.",
     "noise": _noise,
-    "suspicious": _suspicious,
+    "suspicious": lambda names, neighbours: (
+        f"Suspicious rows: {joined(names, _MOST_ROWS)}; "
+        + (
+            f"without them the model describes the data, but {neighbours}: check them, or the "
+            "model is wrong there."
+            if neighbours
+            else "check them (a robust loss down-weights these rows)."
+        )
+    ),
     "jenkins_bound": _jenkins_bound,
-    "flagged": _flagged,
+    "flagged": lambda points, every: (
+        f"The extraction flagged {'every point' if every else f'{len(points)} of the points'} "
+        f"fitted ({joined(points, 1)}): measure them again"
+        f"{'' if every else ', or select the good ones'}."
+    ),
     "beyond_limit": "At {row} the force held exceeds friction's limit ({limit}) by more than the "
     "other elements carry ({carried}): the limit is wrong, or an element is missing.",
     "beyond_slip": "At {row} friction's fundamental is {force}, more than full slip can give "
     "({limit}): an element is missing.",
-    "held_out": _held_out,
+    "held_out": lambda tests, available, gains, phases, rows, width: (
+        f"Without each of {tests}{f' of {available}' * (tests != available)} tests in turn, "
+        f"{gains} of {rows} held-out gains and {phases} of {rows} phases of fundamentals are "
+        f"inside their {_LEVEL} bands (half width {percent(width)})."
+    ),
     "narrow_bands": "The {level} bands (half width {width:percent}) do not cover the misfit "
     "({misfit:percent} rms): no uncertainty can be stated.",
-    "constraint": _constraint,
-    "prior": _prior,
+    "constraint": lambda texts, rise, noise_known, p_value: (
+        f"The data contradict the constraint {listed(texts)} ({p_text(p_value)}): it raises the "
+        f"sum of squares by {rise:.3g} times the {'known' if noise_known else 'estimated'} "
+        "variance of the noise. Check the constraint, or the model."
+    ),
+    "prior": lambda name, value, mean, std: (
+        f"The data contradict the prior of {name}: {value:.4g} against {mean:g} ± {std:g}, "
+        f"{abs(value - mean) / std:.1f} standard deviations: check the calibration, or the model."
+    ),
     "beyond_range": lambda name, value, stderr, low, high: (
         f"The data ask for {name} = {with_unit(value, stderr, '')}, beyond the range that is "
         f"assumed ({low:g} to {high:g}): estimate it ({spelled(f'{name}=None', f'{name}=free')}), "
         "or use another law."
     ),
-    "moved": _moved,
-    "negative": _negative,
-    "slight": _slight,
+    "moved": lambda names, rows: (
+        f"A robust fit moves {listed(names)} by more than one standard uncertainty: check the "
+        f"{'suspicious rows' if rows else 'rows with the largest residuals'}, or fit with "
+        f"{argument('loss', 'huber')}."
+    ),
+    "negative": lambda name, value, stderr, unit, instead: (
+        f"{name} is negative ({with_unit(value, stderr or None, unit)}), as of no device: it "
+        f"stands for what the model lacks, and is not {instead}."
+    ),
+    "slight": lambda name, value, stderr, unit, share, misfit: (
+        f"{name} = {with_unit(value, stderr, unit)} rests on {percent(share)} rms of the force, "
+        f"less than the model misses ({percent(misfit)}): give it, or leave it out."
+    ),
     "steady": "The force was held, and the exact steady motion fitted; the describing function "
     "would be up to {difference:percent} off, at {row}.",
     "jump": _jump,
-    "unstable_rows": _unstable_rows,
+    "unstable_rows": lambda rows: (
+        f"The predicted motion is not stable at {listed(rows)}: the device moves otherwise there, "
+        f"and the steady response cannot describe {'it' if len(rows) == 1 else 'them'}; leave "
+        f"{'this row' if len(rows) == 1 else 'these rows'} out."
+    ),
     "distorted_force": _distorted_force,
     "no_steady_motion": "The force was held, but the describing function predicts the motion: the "
     "plant would drive itself, and no steady motion is there.",

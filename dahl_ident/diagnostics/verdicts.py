@@ -11,7 +11,7 @@ tenth of the size at which they would make up the whole response, whichever size
 parameters of records are judged to first order, and are not identified above 0.3.
 
 Where parameters are not identified, combinations of them may be
-(:mod:`dahl_ident.diagnostics.combinations`); where no known combination fits, the least
+(:mod:`dahl_ident.diagnostics.budget`); where no known combination fits, the least
 determined direction is given as a vector.
 """
 
@@ -27,8 +27,8 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.advice import advice
-from dahl_ident.diagnostics.budget import ParameterBudget
-from dahl_ident.diagnostics.combinations import candidates, stiffness_seen
+from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.diagnostics.budget import ParameterBudget, candidates, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, coverage_factor, level_text, thresholds
 from dahl_ident.diagnostics.contributions import EXPONENT, MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -106,19 +106,6 @@ class ParameterVerdict:
 
 
 @dataclass(frozen=True)
-class StatedCombination:
-    """A combination that is determined although its parameters are not."""
-
-    expression: str
-    unit: str
-    value: float
-    stderr: float
-
-    def __str__(self) -> str:
-        return f"{self.expression} = {with_unit(self.value, self.stderr, self.unit)}"
-
-
-@dataclass(frozen=True)
 class Identifiability:
     """Which parameters and combinations the data determine.
 
@@ -131,7 +118,7 @@ class Identifiability:
     """
 
     parameters: Mapping[str, ParameterVerdict]
-    combinations: tuple[StatedCombination, ...]  # determined ones, of parameters that are not
+    combinations: tuple[DerivedQuantity, ...]  # determined ones, of parameters that are not
     # where no combination is known: the least determined direction in the parameters' logarithms
     # (in sizes that matter for those that have none)
     direction: Mapping[str, float]
@@ -150,7 +137,7 @@ class Identifiability:
         """Names of the identified parameters, then of the combinations."""
         return (
             *self.named(Verdict.IDENTIFIED),
-            *(combination.expression for combination in self.combinations),
+            *(combination.name for combination in self.combinations),
         )
 
     @property
@@ -229,10 +216,12 @@ def judged(
     else:
         intervals = profile_of()
     spread = np.maximum(fisher, _profile_std(optimum, intervals, natural)).tolist()
-    verdicts = {
-        name: _verdict(std, intervals[name][-1])
-        for name, std in zip(problem.names, spread, strict=True)
-    }
+    verdicts = {}
+    for name, std in zip(problem.names, spread, strict=True):
+        closed = np.isfinite(intervals[name][-1]).all() and std <= NOT_IDENTIFIED_ABOVE
+        verdicts[name] = Verdict.WEAK if closed else Verdict.NOT_IDENTIFIED
+        if std < IDENTIFIED_BELOW:
+            verdicts[name] = Verdict.IDENTIFIED
     not_by_noise = dict[str, str]()
     ambiguous = _ambiguous(optimum)
     if errors is not None:
@@ -243,8 +232,10 @@ def judged(
             if verdicts[name] is Verdict.IDENTIFIED and 0.5 * U / size > IDENTIFIED_BELOW:
                 verdicts[name] = Verdict.WEAK
     verdicts |= dict.fromkeys((*not_by_noise, *ambiguous), Verdict.NOT_IDENTIFIED)
-    for name in _set_by_prior(optimum, errors):
-        if verdicts[name] is Verdict.IDENTIFIED:
+    stderr = optimum.stderr if errors is None else errors.stderr
+    for name, prior in problem.priors.items():
+        informative = stderr[name] > _BY_PRIOR * float(prior.std())
+        if informative and verdicts[name] is Verdict.IDENTIFIED:
             verdicts[name] = Verdict.BY_PRIOR
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
     loose = lost | {n for n, v in verdicts.items() if v is Verdict.WEAK}
@@ -254,7 +245,7 @@ def judged(
         std = float(information.std(seen.direction))
         if std < IDENTIFIED_BELOW:
             u = abs(seen.value) * std
-            determined.append(StatedCombination(seen.expression, seen.unit, seen.value, u))
+            determined.append(DerivedQuantity(seen.expression, seen.unit, None, seen.value, u))
     parameters = {}
     for name, parameter in zip(problem.names, problem.parameters, strict=True):
         unit = parameter.unit
@@ -275,13 +266,6 @@ def judged(
         direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
         direction = direction if len(direction) > 1 else {}
     return Identifiability(parameters, tuple(determined), direction)
-
-
-def _set_by_prior(optimum: Optimum, errors: ErrorModel | None) -> list[str]:
-    """Return the names of parameters about which a prior has more information than the data."""
-    stderr = optimum.stderr if errors is None else errors.stderr
-    priors = optimum.problem.priors.items()
-    return [name for name, prior in priors if stderr[name] > _BY_PRIOR * float(prior.std())]
 
 
 def _lost_beyond_noise(
@@ -382,19 +366,12 @@ def _profile_std(
     return np.where(np.isnan(std), np.inf, std)
 
 
-def _verdict(std: float, widest: Interval) -> Verdict:
-    if std < IDENTIFIED_BELOW:
-        return Verdict.IDENTIFIED
-    closed = np.isfinite([widest.lower, widest.upper]).all() and std <= NOT_IDENTIFIED_ABOVE
-    return Verdict.WEAK if closed else Verdict.NOT_IDENTIFIED
-
-
 def _combinations(
     optimum: Optimum,
     sources: Mapping[str, ParameterBudget],
     lost: frozenset[str],
     loose: frozenset[str],
-) -> Iterator[StatedCombination]:
+) -> Iterator[DerivedQuantity]:
     """Yield the combinations in the budget of parameters that are not identified.
 
     A product is only informative with two `loose` parameters, which are weakly or not identified,
@@ -412,7 +389,8 @@ def _combinations(
         if enough:
             stated.add(candidate.expression)
     for name in (name for name in sources if lost and name in stated - {*optimum.names}):
-        yield StatedCombination(name, sources[name].unit, sources[name].value, sources[name].u)
+        known = sources[name]
+        yield DerivedQuantity(name, known.unit, None, known.value, known.u)
 
 
 def within(limits: Interval, unit: str) -> str:

@@ -1,6 +1,6 @@
 """Uncertainties after measurements at candidates, in addition to earlier data.
 
-The model error of an earlier fit (:mod:`dahl_ident.diagnostics.prediction_error`) enters as W more
+The model error of an earlier fit (:mod:`dahl_ident.diagnostics.bands`) enters as W more
 parameters, shared by earlier and later levels: a level close to a measured one then has little
 information, however long it is measured. Parameters that may be needed although the model fixes or
 omits them are forecast in a larger model.
@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.bands import Departures, departures
 from dahl_ident.diagnostics.confidence_levels import coverage_factor
-from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import OF_DRAWS, Candidates
 from dahl_ident.planning.design import Design, Term, packed_information
