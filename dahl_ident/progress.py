@@ -18,7 +18,7 @@ class Show(Protocol):
 
 
 @contextmanager
-def spinner(task: str, patience: float = PATIENCE) -> Iterator[Show]:
+def spinner(task: str, patience: float | None = None) -> Iterator[Show]:
     """Show on standard error, after some seconds, that a task is running, and the time elapsed.
 
     Standard output is for results. The yielded function reports progress; with the number of steps,
@@ -36,7 +36,7 @@ def spinner(task: str, patience: float = PATIENCE) -> Iterator[Show]:
     def show(words: str, done: float = 0.0, total: float | None = None) -> None:
         bar.update(number, description=f"{task}{words}", completed=done, total=total)
 
-    timer = threading.Timer(patience, bar.start)
+    timer = threading.Timer(PATIENCE if patience is None else patience, bar.start)
     timer.daemon = True
     timer.start()
     try:

@@ -371,7 +371,7 @@ def posterior(
     >>> data = di.FrequencyResponse(np.ones(9), N * np.exp(noise[0] + 1j * noise[1]), A)
     >>> chain = di.posterior(data, di.Dahl(alpha=1.0), seed=1)
     >>> chain.converged, chain.names
-    (True, ('f_max', 'sigma', 'noise_scale'))
+    (True, ('f_max', 'sigma'))
     >>> grid = di.posterior(data, di.Dahl(alpha=1.0), method="grid")
     >>> grid.converged, round(float(grid.quantile("f_max", 0.5)), 2)
     (True, 0.1)

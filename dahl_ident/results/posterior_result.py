@@ -73,10 +73,10 @@ class Posterior(Result):
     (('f_max', 'sigma', 'alpha'), 60, False)
     >>> grid = di.posterior(data, di.Dahl(alpha=1.0), method="grid")
     >>> print(grid.message)
-    Converged: error 0.0006 of the probability, 192 points.
+    Converged: error 0.0008 of the probability, 192 points.
     >>> low, high = grid.quantile("f_max", [0.02275, 0.97725])
     >>> print(f"f_max from {low:.4f} to {high:.4f} N")
-    f_max from 0.0992 to 0.1004 N
+    f_max from 0.0992 to 0.1005 N
     """
 
     _called = "a posterior"
