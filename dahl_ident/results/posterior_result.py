@@ -62,7 +62,8 @@ class Posterior(Result):
 
     Made by :func:`dahl_ident.posterior`. The draws are those of a Markov chain, with the names of
     emcee, or importance points (``method="grid"``), which are reproducible and have a known error.
-    An unknown scale of the noise is called ``noise_scale``.
+    An unknown scale of the noise is called ``noise_scale``; where other errors count, it is the
+    fit's and not sampled.
 
     Examples
     --------
