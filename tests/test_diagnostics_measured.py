@@ -126,8 +126,8 @@ class TestBeam:
         found = self.fitted(beam, controlled)
         assert not found.trusted
         assert {"f_max", "sigma"} <= set(found.identifiability.named(Verdict.NOT_IDENTIFIED))
-        (kappa,) = (c for c in found.identifiability.combinations if "^2" in c.expression)
-        assert kappa.expression == "sigma^2/f_max"
+        (kappa,) = (c for c in found.identifiability.combinations if "^2" in c.name)
+        assert kappa.name == "sigma^2/f_max"
         assert 3.8e7 < kappa.value < 4.7e7
         assert "f_max/sigma" not in found.identifiability.determined
         assert "f_max: at least" in found.verdict
