@@ -9,9 +9,9 @@ and, for forces, a drift.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
-from dahl_ident.elements import Model, Parameter
+from dahl_ident.elements import Friction, Model, Parameter
+from dahl_ident.elements.facts import Path
 from dahl_ident.errors import DataError, FitError
 from dahl_ident.noise import Rho
 from dahl_ident.problem.base import Quadratic
-from dahl_ident.problem.record_prediction import Predicted, force_of, motion_of
 from dahl_ident.problem.record_waves import SHORTEST, RecordWaves, bends, endings
 from dahl_ident.problem.space import Interchangeable, Space
 from dahl_ident.problem.table_problem import TableProblem
@@ -32,6 +32,17 @@ _SAMPLES_PER_CYCLE = 100.0  # of a record that is thinned
 _DELAY_STEP = 0.02  # step of the delay, in samples, for difference quotients
 _TINY = 1e-300  # replaces a positive value that is zero, which has no logarithm
 _VANISHED = 1e4  # gradient over curvature of a value that has vanished: its steps never end
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """The predicted samples of a record, with derivatives."""
+
+    output: FloatArray
+    by: FloatArray
+    """Derivatives with respect to the problem's values, (n, P); P = 0 if they are not wanted."""
+    by_delay: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Derivative of a motion with respect to the delay."""
 
 
 class RecordProblem(RecordWaves):
@@ -209,7 +220,7 @@ class RecordProblem(RecordWaves):
 
     def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Predicted:
         """Return the predicted samples of record `number`."""
-        predict = force_of if self.output == "force" else motion_of
+        predict = _force_of if self.output == "force" else _motion_of
         names = self.names if derivatives else ()
         key = np.append(self.full_values(values), self.record_values(values, number)).tobytes()
         latest = self.latest.get(number)
@@ -305,3 +316,70 @@ class RecordProblem(RecordWaves):
         if std == 0.0:
             raise DataError("the output of the records is constant; nothing can be fitted to it")
         return std
+
+
+def _force_of(
+    problem: RecordWaves, values: FloatArray, number: int, *, derivatives: bool
+) -> Predicted:
+    """Return the force of a measured displacement at the samples of record `number`."""
+    x, v, a = problem.motions[number]
+    path = x if problem.paths is None else problem.paths[number]
+    record = problem.records[number]
+    of_record = problem.record_values(values, number)
+    time = record.time - record.time[0]
+    offset, drift = of_record[-2:].tolist()
+    total = offset + drift * time
+    by = np.zeros((x.size, len(problem.parameters) if derivatives else 0))
+    start, column = 0, 0
+    first = len(problem.free) + number * problem.per_record
+    for element, at in problem.model.of(problem.full_values(values)):
+        stop = start + (len(element.starts) if element.has_memory else element.n_states)
+        states, moved = of_record[start:stop], x
+        state: Any = 0.0  # an array for elements of several unknowns
+        if isinstance(element, Friction):
+            state, moved = states if states.size > 1 else float(states[0]), path
+        history = element.history(at, Path(moved, v, a, time), state, slopes=derivatives)
+        total = total + history.value
+        if derivatives:
+            for parameter, slope in zip(element.parameters, history.by_parameter, strict=True):
+                if parameter.free:
+                    by[:, column] = slope
+                    column += 1
+            if element.has_memory:
+                by[:, first + start : first + stop] = history.by_state.reshape(x.size, -1)
+        if element.n_states and not element.has_memory:
+            free = element.free_responses(time)
+            total = total + free @ states
+            if derivatives:
+                by[:, first + start : first + stop] = free
+        start = stop
+    if derivatives:
+        by[:, first + start] = 1.0
+        by[:, first + start + 1] = time
+    return Predicted(total, by)
+
+
+def _motion_of(
+    problem: RecordWaves, values: FloatArray, number: int, *, derivatives: bool
+) -> Predicted:
+    """Return the motion of a driven plant at the samples of record `number`."""
+    from dahl_ident.engine import march
+
+    of_record, free = problem.record_values(values, number), values[: len(problem.free)]
+    starts = of_record.size - 1
+    at, slopes = (part[0] for part in problem.coefficients(np.array([problem.full_values(values)])))
+    slopes = slopes[:, [p.free for p in problem.model.parameters]]
+    chosen = np.flatnonzero(slopes.any(axis=1)).tolist()
+    first, by_start, by_value = problem.first(of_record[:starts], at)
+    time, drive = problem.drives[number]
+    motion = march(
+        problem.system, time, drive, time, first, at, chosen=chosen, derivatives=derivatives
+    )
+    by = np.zeros((motion.output.size, len(problem.parameters) if derivatives else 0))
+    if derivatives:
+        column = free.size + number * problem.per_record
+        by_number = motion.by_parameter + motion.by_first @ by_value[:, chosen]
+        by[:, : free.size] = by_number @ slopes[chosen]
+        by[:, column : column + starts] = motion.by_first @ by_start
+        by[:, column + starts] = 1.0
+    return Predicted(motion.output + of_record[starts], by, motion.by_delay)
