@@ -339,7 +339,10 @@ class Predictor:
         derivatives: int,
         error: FloatArray | None,
     ) -> StiffnessGradient:
-        """Return Z by the describing function, with derivatives by ln A or ln u_0, and values."""
+        """Return Z by the describing function, and its derivatives.
+
+        They are with respect to ln A, or ln u_0 if the drive is held, and to the values.
+        """
         forced, exists, drive = group.forced, np.ones((), dtype=np.bool_), None
         amplitude = group.amplitude if self._exact_sensors else group.amplitude / sensor_values[1]
         if forced:
