@@ -22,23 +22,22 @@ Predicted responses and their bands are computed at the draws, without lineariza
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.bayes.density import SCALE, TAIL_DOF, Density
+from dahl_ident.bayes.density import TAIL_DOF, Density
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data.storage import library
-from dahl_ident.diagnostics.checks import assumptions
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 
 if TYPE_CHECKING:
-    from dahl_ident.results.posterior_result import Posterior
+    from dahl_ident.results.fit_result import FitResult
 
 _NEARLY_AS_WIDE = 0.5  # width over the prior's, from which the data add little
 _PRIOR_END = 0.01  # probability of the prior that counts as its end
@@ -281,52 +280,16 @@ def _central(values: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-def objections(posterior: Posterior) -> Iterator[Finding]:
-    """Yield convergence, influences of priors, and contradictions."""
-    converged, fit = posterior.converged, posterior.counted_fit
-    code = "sampled" if converged else "not_converged"
-    severity = VerdictStatus.TRUSTED if converged else VerdictStatus.NOT_DETERMINED
-    yield Finding(Question.DETERMINED, severity, code, {"message": posterior.message})
-    lost = VerdictStatus.NOT_DESCRIBED if converged else VerdictStatus.NOT_DETERMINED
-    for influence in posterior.prior_influences:
-        by_default = influence.name in posterior.default_priors
-        left_open = VerdictStatus.NOT_DETERMINED if by_default else VerdictStatus.TRUSTED
-        yield influence.finding(lost if influence.contradicted else left_open)
-    yield from (replace(finding, severity=lost) for finding in _misfits(posterior))
-    if fit is not None and fit.status is not VerdictStatus.NOT_DESCRIBED:
-        yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
-
-
-def _misfits(posterior: Posterior) -> tuple[Finding, ...]:
-    """Return findings that the data contradict the model."""
-    fit = posterior.fit
-    if fit is None or (posterior.counted_fit is None and posterior.normalised):
+def contradictions(
+    fit: FitResult | None, checks: Sequence[PredictiveCheck], by_checks: bool
+) -> tuple[Finding, ...]:
+    """Return findings that the data contradict the model: of the checks, or else of the fit."""
+    if fit is None or by_checks:
         lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
-        failed = (check for check in posterior.checks if not check.passed)
+        failed = (check for check in checks if not check.passed)
         return tuple(Finding(*lost, "predictive_check", {"text": str(c)}) for c in failed)
     if fit.status is VerdictStatus.NOT_DETERMINED and fit.goodness.objections:
         return tuple(fit.goodness.findings())
     if fit.status is not VerdictStatus.NOT_DESCRIBED:
         return ()
     return tuple(f for f in fit.findings if f.severity is not VerdictStatus.TRUSTED)
-
-
-def notes(posterior: Posterior) -> Iterator[Finding]:
-    """Yield counted sources of error, assumptions, and the evidence."""
-    fit, counted = posterior.fit, posterior.counted_fit is not None
-    if fit is not None and posterior.likelihood != "none":
-        assumed, names = Question.ASSUMED, posterior.names
-        if counted:
-            free = (n for n in names if n not in (*fit.problem.names, SCALE))
-            ranges = (f"{name} as a parameter, which was not given" for name in free)
-            sources = {"sources": (*posterior.counted, *ranges)}
-            yield Finding(assumed, VerdictStatus.TRUSTED, "counted", sources)
-        elif fit.errors is not None:
-            std = zip(names, posterior.std().tolist(), strict=True)
-            known = ((n, s) for n, s in std if n in fit.var_names)
-            u = [f"{fit.params[n].stderr:.2g} for {n} (here {s:.2g})" for n, s in known]
-            yield Finding(assumed, VerdictStatus.TRUSTED, "noise_alone", {"compared": tuple(u)})
-        yield from assumptions(fit.assessment, counted=counted)
-    if not posterior.is_chain and posterior.normalised:
-        evidence = {"ln": posterior.log_evidence}
-        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", evidence)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,13 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dahl_ident.arrays import (
-    FloatArray,
-    array_between,
-    finite_array,
-    positive_array,
-    whole_number,
-)
+from dahl_ident.arrays import FloatArray, array_between, finite_array, positive_array, whole_number
 from dahl_ident.bayes.chain import Convergence
 from dahl_ident.bayes.density import SCALE, LogDensity
 from dahl_ident.bayes.importance import WeightedDraws
@@ -28,8 +23,8 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.storage import plain_data
 from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at, quantities
 from dahl_ident.diagnostics.budget import Budget
-from dahl_ident.diagnostics.checks import reading
-from dahl_ident.diagnostics.judgement import Judgement
+from dahl_ident.diagnostics.checks import assumptions, reading
+from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
 from dahl_ident.results.fit_result import FitResult
@@ -37,8 +32,7 @@ from dahl_ident.results.posterior_checks import (
     PredictiveBand,
     PredictiveCheck,
     PriorInfluence,
-    notes,
-    objections,
+    contradictions,
     predictive_checks,
     prior_influences,
     to_arviz,
@@ -392,7 +386,43 @@ class Posterior(Result):
         Not determined if it has not converged, or a default prior sets a parameter; not described
         if data and model or prior contradict each other; approximate if the fit is.
         """
-        return Judgement([*objections(self), *notes(self), *reading(self)])
+        return Judgement([*self._objections(), *self._notes(), *reading(self)])
+
+    def _objections(self) -> Iterator[Finding]:
+        """Yield convergence, influences of priors, and contradictions."""
+        converged, fit = self.converged, self.counted_fit
+        severity = VerdictStatus.TRUSTED if converged else VerdictStatus.NOT_DETERMINED
+        code = "sampled" if converged else "not_converged"
+        yield Finding(Question.DETERMINED, severity, code, {"message": self.message})
+        lost = VerdictStatus.NOT_DESCRIBED if converged else VerdictStatus.NOT_DETERMINED
+        for influence in self.prior_influences:
+            by_default = influence.name in self.default_priors
+            left_open = VerdictStatus.NOT_DETERMINED if by_default else VerdictStatus.TRUSTED
+            yield influence.finding(lost if influence.contradicted else left_open)
+        for finding in contradictions(self.fit, self.checks, fit is None and self.normalised):
+            yield replace(finding, severity=lost)
+        if fit is not None and fit.status is not VerdictStatus.NOT_DESCRIBED:
+            yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
+
+    def _notes(self) -> Iterator[Finding]:
+        """Yield counted sources of error, assumptions, and the evidence."""
+        fit, counted = self.fit, self.counted_fit is not None
+        if fit is not None and self.likelihood != "none":
+            if counted:
+                free = (n for n in self.names if n not in (*fit.problem.names, SCALE))
+                ranges = (f"{name} as a parameter, which was not given" for name in free)
+                sources = {"sources": (*self.counted, *ranges)}
+                yield Finding(Question.ASSUMED, VerdictStatus.TRUSTED, "counted", sources)
+            elif fit.errors is not None:
+                std = zip(self.names, self.std().tolist(), strict=True)
+                known = ((n, s) for n, s in std if n in fit.var_names)
+                u = [f"{fit.params[n].stderr:.2g} for {n} (here {s:.2g})" for n, s in known]
+                values = {"compared": tuple(u)}
+                yield Finding(Question.ASSUMED, VerdictStatus.TRUSTED, "noise_alone", values)
+            yield from assumptions(fit.assessment, counted=counted)
+        if not self.is_chain and self.normalised:
+            evidence = {"ln": self.log_evidence}
+            yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", evidence)
 
     @property
     def counted_fit(self) -> FitResult | None:
@@ -414,8 +444,7 @@ class Posterior(Result):
         apply.
         """
         density: Any = self._density
-        has_shared_errors = self.counted_fit is not None
-        if self.likelihood == "none" or has_shared_errors or not density.normalised:
+        if self.likelihood == "none" or self.counted_fit is not None or not density.normalised:
             return ()
         return predictive_checks(density, self._drawn(_CHECK_DRAWS, 0), np.random.default_rng(0))
 
