@@ -31,9 +31,11 @@ PACKAGES = ("numpy", "scipy", "casadi", "emcee", "control", "lmfit")
 
 
 def main() -> None:
-    """Print all tables, and write them to a file where asked."""
+    """Print all tables, and write them to a file with ``--write``."""
     parser = argparse.ArgumentParser(description="time this package and its peers")
-    parser.add_argument("topics", nargs="*", default=TOPICS, help=f"of {', '.join(TOPICS)}")
+    parser.add_argument(
+        "topics", nargs="*", default=TOPICS, help=f"topics to run: {', '.join(TOPICS)}"
+    )
     parser.add_argument("--write", type=Path, help="write the tables to this Markdown file")
     arguments = parser.parse_args()
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
@@ -41,8 +43,8 @@ def main() -> None:
         "# Benchmarks\n\nMeasured side by side by `make bench`; ratios carry over to "
         "other machines, times do not.\n\n"
         f"Python {platform.python_version()}, {versions}. {os.cpu_count()} processors, "
-        f"load average {os.getloadavg()[0]:.1f} at the start. Times are the "
-        "processor's; on a busy machine they are up to twice those on an idle one."
+        f"load average {os.getloadavg()[0]:.1f} at the start. Times are "
+        "processor times; on a busy machine they are up to twice those on an idle one."
     ]
     print(parts[0])
     for topic in arguments.topics:

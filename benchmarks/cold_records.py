@@ -1,7 +1,6 @@
-"""Fits of records from a cold start: ``python -m benchmarks.cold_records --write PAGE.md``.
+"""Fits of records without a start: ``python -m benchmarks.cold_records --write PAGE.md``.
 
-The cases of `tests/cold_records.py`, several seeds each. Every record is made by an independent
-solver; a fit is given no start.
+The cases of `tests/cold_records.py`, several seeds each. An independent solver makes every record.
 """
 
 from __future__ import annotations
@@ -44,25 +43,24 @@ uncertainties u, of all free parameters and seeds together. Solved: the status i
 """
 
 
-def row(name: str, made: Callable[[int], Case]) -> str:
-    """Return a row of the table."""
+def row(name: str, make_case: Callable[[int], Case]) -> str:
+    """Return the row of one case, with the deviations of all seeds and free parameters."""
     deviations, solved, seconds = [], 0, 0.0
     for seed in range(SEEDS):
-        case = made(seed)
-        began = time.process_time()
+        case = make_case(seed)
+        start = time.process_time()
         try:
             fit = di.fit(case.record, case.model, throw=False)
-            own = [
-                (fit.params[p.name].value - float(p.value or 0.0)) / float(u)
-                for p in case.truth.parameters
-                if (u := fit.params[p.name].stderr) and fit.params[p.name].vary
-            ]
-            usable = fit.status.usable
         except DahlIdentError:
-            own, usable = [np.inf], False
-        seconds += time.process_time() - began
-        solved += usable
-        deviations += own
+            deviations.append(np.inf)
+        else:
+            solved += fit.status.usable
+            for true in case.truth.parameters:
+                estimate = fit.params[true.name]
+                if estimate.vary and estimate.stderr:
+                    error = estimate.value - float(true.value or 0.0)
+                    deviations.append(error / estimate.stderr)
+        seconds += time.process_time() - start
     size = np.abs(deviations)
     return (
         f"| {name} | {SEEDS} | {solved} | {np.mean(size < 2.0):.0%} | {np.mean(size < 3.0):.0%} | "
@@ -74,13 +72,13 @@ def main() -> None:
     """Print the table, or write it into a page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", type=Path)
-    place = parser.parse_args().write
+    page = parser.parse_args().write
     rows = []
-    for name, made in CASES.items():
-        rows.append(row(name, made))
+    for name, make_case in CASES.items():
+        rows.append(row(name, make_case))
         print(rows[-1], flush=True)
-    if place is not None:
-        place.write_text(_HEAD + "\n".join(rows) + "\n", encoding="utf-8")
+    if page is not None:
+        page.write_text(_HEAD + "\n".join(rows) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ LAWS: dict[str, Callable[[float, float, np.random.Generator], Drawn]] = {
 KINKS = (
     "Backlash", "Bouc-Wen", "Maxwell slip", "Iwan", "Power damper", "Dahl, any exponent", "LuGre",
 )  # fmt: skip
-WAYS: dict[str, Callable[[Any, float], list[loop_oracles.Way]]] = {
+BRANCHES: dict[str, Callable[[Any, float], list[loop_oracles.Branch]]] = {
     "Dahl": loop_oracles.dahl,
     "Dahl, any exponent": loop_oracles.dahl,
     "Dahl, two limits": loop_oracles.dahl,
@@ -211,8 +211,8 @@ def any_amplitude(name: str, rng: np.random.Generator) -> Case:
     if name == "Backlash":  # a gap that is not crossed leaves nothing
         amplitude += 0.5 * drawn.hand.gap
     note = f"amplitude {amplitude / drawn.length:.3g} x_c, {np.array(drawn.values)}"
-    ways = WAYS[name](drawn.hand, amplitude)
-    expected = loop_oracles.harmonics_of(ways, amplitude, HARMONICS)
+    branches = BRANCHES[name](drawn.hand, amplitude)
+    expected = loop_oracles.harmonics_of(branches, amplitude, HARMONICS)
     law, behind_gap = drawn.element, isinstance(drawn.element, di.Backlash)
     if isinstance(law, di.Backlash):
         law = law.element
@@ -358,7 +358,7 @@ def table(cases: int, seed: int = SEED) -> tuple[str, list[str]]:
             done, refused = [], 0
             if name == "Iwan" and check not in (history, any_amplitude):
                 continue  # thirty events in each half cycle take the oracle half a minute
-            if check is any_amplitude and name not in WAYS:
+            if check is any_amplitude and name not in BRANCHES:
                 continue
             exact = check is any_amplitude or (check is history and name in CLOSED)
             for _ in range(_EXACT * each if exact else each):

@@ -1,9 +1,10 @@
-"""Settled loops of any amplitude in closed form, and their harmonics by Gauss's quadrature.
+"""Settled loops of any amplitude in closed form, and their harmonics by Gauss quadrature.
 
-A loop under x = A cos(theta) has a way down from its top and a way up from its bottom. Each is in
-closed form over the path since its beginning; top and bottom follow from each other, in sixty
-digits where a loop is asymmetric. So amplitudes may be any number of characteristic displacements,
-where an integrator in small steps would not come to an end.
+A loop under x = A cos(theta) has a branch down from its top and a branch up from its bottom. The
+force on each is a closed-form function of the path since the turning point; the forces at top and
+bottom follow from each other, with sixty digits because they may differ by less than rounding. The
+amplitude may be any number of characteristic displacements, which an integrator with small steps
+could not cover.
 """
 
 from __future__ import annotations
@@ -19,31 +20,33 @@ from benchmarks.motion_oracles import BoucWenByHand, DahlByHand, JenkinsByHand
 from dahl_ident.arrays import ComplexArray, FloatArray
 
 _DIGITS = 60
-_NARROWEST = 1e-13  # of a half cycle, rad: the first panel
+_NARROWEST = 1e-13  # rad: width of the narrowest panel
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
-class Way(NamedTuple):
-    """Half a loop: the force over the path from its beginning, and where it has kinks."""
+class Branch(NamedTuple):
+    """Half a loop: the force as a function of the path from the turning point, and its kinks."""
 
     force: Callable[[FloatArray], FloatArray]
-    kinks: Sequence[float]
+    kinks: Sequence[float]  # paths
 
 
-def harmonics_of(ways: Sequence[Way], amplitude: float, orders: Sequence[int]) -> ComplexArray:
-    """Return c_k of F = sum of Re c_k exp(j k theta) from the ways down and up."""
+def harmonics_of(
+    branches: Sequence[Branch], amplitude: float, orders: Sequence[int]
+) -> ComplexArray:
+    """Return c_k of F = sum of Re c_k exp(j k theta) from the branches down and up."""
     k = np.array(orders)
     total = np.zeros(k.size, dtype=np.complex128)
-    for way, begin in zip(ways, (0.0, np.pi), strict=True):
-        psi, weights = _panels([2.0 * np.arcsin(np.sqrt(min(p / (2.0 * amplitude), 1.0)))
-                                for p in way.kinks])  # fmt: skip
-        force = way.force(2.0 * amplitude * np.sin(0.5 * psi) ** 2)
-        total += np.exp(-1j * np.outer(k, psi + begin)) @ (weights * force)
+    for branch, start in zip(branches, (0.0, np.pi), strict=True):
+        shares = np.minimum(np.array(branch.kinks) / (2.0 * amplitude), 1.0)
+        psi, weights = _panels(2.0 * np.arcsin(np.sqrt(shares)))
+        force = branch.force(2.0 * amplitude * np.sin(0.5 * psi) ** 2)
+        total += np.exp(-1j * np.outer(k, psi + start)) @ (weights * force)
     return np.asarray(np.where(k == 0, 0.5, 1.0) / np.pi * total)
 
 
-def _panels(kinks: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-    """Return nodes and weights on (0, pi) in panels that shrink towards the turn and the kinks."""
+def _panels(kinks: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return nodes and weights on (0, pi), in panels that narrow towards 0 and towards kinks."""
     near = np.pi * 2.0 ** -np.arange(0.0, 45.0)
     ends = [0.0, np.pi, *near]
     for kink in kinks:
@@ -55,8 +58,8 @@ def _panels(kinks: Sequence[float]) -> tuple[FloatArray, FloatArray]:
     return psi.ravel(), (half * _WEIGHTS).ravel()
 
 
-def dahl(law: DahlByHand, amplitude: float) -> list[Way]:
-    """Return the ways of Dahl's law with any exponent and two limits, or behind a gap."""
+def dahl(law: DahlByHand, amplitude: float) -> list[Branch]:
+    """Return the branches of Dahl's law with any exponent and two limits, or behind a gap."""
     up, down = (law.f_max * (1.0 + s * law.asymmetry) for s in (1.0, -1.0))
     travel = 2.0 * amplitude - (law.gap or 0.0)
     with mpmath.workdps(_DIGITS):
@@ -79,11 +82,11 @@ def dahl(law: DahlByHand, amplitude: float) -> list[Way]:
             low, high = (middle, high) if excess(middle) > 0 else (low, middle)
         bottom = (low + high) / 2
         top = end(bottom, mpmath.mpf(up))
-    return [_dahl_way(law, -1.0, down, -float(top)), _dahl_way(law, 1.0, up, float(bottom))]
+    return [_dahl_branch(law, -1.0, down, -float(top)), _dahl_branch(law, 1.0, up, float(bottom))]
 
 
-def _dahl_way(law: DahlByHand, heading: float, limit: float, start: float) -> Way:
-    """Return a way; `start` is the force along the motion where it begins, below zero."""
+def _dahl_branch(law: DahlByHand, direction: float, limit: float, start: float) -> Branch:
+    """Return a branch; `start` < 0 is its first force, counted along the motion."""
     margin, alpha, gap = 1.0 - start / limit, law.alpha, law.gap or 0.0
     log = np.log1p(-start / limit)
     to_zero = log if alpha == 1.0 else np.expm1((1.0 - alpha) * log) / (1.0 - alpha)
@@ -101,13 +104,13 @@ def _dahl_way(law: DahlByHand, heading: float, limit: float, start: float) -> Wa
             else:
                 left = -(1.0 - alpha) * margin ** (alpha - 1.0) * span
                 log = np.log1p(np.maximum(left, -1.0)) / (1.0 - alpha)
-        return np.asarray(heading * (start - limit * margin * np.expm1(log)))
+        return np.asarray(direction * (start - limit * margin * np.expm1(log)))
 
-    return Way(force, kinks)
+    return Branch(force, kinks)
 
 
-def bouc_wen(law: BoucWenByHand, amplitude: float) -> list[Way]:
-    """Return the ways of Bouc-Wen's law with exponent 1: exponentials to zero force and beyond."""
+def bouc_wen(law: BoucWenByHand, amplitude: float) -> list[Branch]:
+    """Return the branches of Bouc-Wen's law with exponent 1: an exponential on each side of 0 N."""
     sigma, q, p = law.sigma, law.q, law.p
 
     def top(loaded: float) -> float:
@@ -128,16 +131,16 @@ def bouc_wen(law: BoucWenByHand, amplitude: float) -> list[Way]:
         beyond = sigma / q * np.expm1(-q * np.maximum(path - zero, 0.0))
         return np.asarray(np.where(path < zero, falling, beyond))
 
-    return [Way(force, [zero]), Way(lambda path: -force(path), [zero])]
+    return [Branch(force, [zero]), Branch(lambda path: -force(path), [zero])]
 
 
-def jenkins(law: JenkinsByHand, amplitude: float) -> list[Way]:
-    """Return the ways of Jenkins elements: each sticks over twice its own amplitude."""
-    reach = [min(amplitude, d) for d in law.slips]
+def jenkins(law: JenkinsByHand, amplitude: float) -> list[Branch]:
+    """Return the branches of Jenkins elements: each sticks over twice its largest extension."""
+    extensions = [min(amplitude, d) for d in law.slips]
 
     def force(path: FloatArray) -> FloatArray:
-        parts = zip(law.stiffnesses, reach, strict=True)
+        parts = zip(law.stiffnesses, extensions, strict=True)
         return np.asarray(sum(k * (d - np.minimum(path, 2.0 * d)) for k, d in parts))
 
-    kinks = [2.0 * d for d in reach if d < amplitude]
-    return [Way(force, kinks), Way(lambda path: -force(path), kinks)]
+    kinks = [2.0 * d for d in extensions if d < amplitude]
+    return [Branch(force, kinks), Branch(lambda path: -force(path), kinks)]

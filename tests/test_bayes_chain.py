@@ -47,7 +47,7 @@ def test_r_hat_sees_ensembles_apart_and_drift():
 
 def test_the_verdict_says_what_is_missing():
     verdict = judge(autoregression(200, 16, 0.9), 4, required=5000.0)
-    assert not verdict.reached
+    assert not verdict.converged
     assert "autocorrelation times, expected 50" in verdict.unmet[0]
     assert "effective draws, expected 5000" in verdict.unmet[-1]
     stuck = judge(np.ones((100, 8, 1)), 4, required=10.0)

@@ -161,7 +161,7 @@ def test_changed_options_are_named_before_anything_runs(tmp_path):
 WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "no file": ({"files__pattern": "nowhere/{device}.csv"}, "finds no file"),
     "no device": ({"files__pattern": "{name}.csv"}, r"has no \{device\}"),
-    "twice": ({"files__pattern": "{device}_{device}.csv"}, "names a field twice"),
+    "twice": ({"files__pattern": "{device}_{device}.csv"}, "has the same field twice"),
     "kind": ({"files__kind": "sheet"}, "expected one of record, response"),
     "option": ({"fit__nose": "relative"}, r"unknown options in \[fit\]: nose"),
     "table": ({"fitt__noise": "relative"}, "unknown tables: fitt"),
@@ -172,7 +172,7 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "per": ({"output__per": "day"}, "expected one of device, run"),
     "folder": ({"output__folder": 3}, "expected the path of a folder"),
     "reports": ({"output__reports": "no"}, "expected true or false"),
-    "date": ({"fit__noise": date(2026, 1, 1)}, "a date or time"),
+    "date": ({"fit__noise": date(2026, 1, 1)}, "a date or a time"),
 }
 
 
@@ -208,8 +208,8 @@ def test_duplicates_and_missing_covariates_are_named(tmp_path):
     [
         ("device,t\nd000\n", "line 2 has 1 values; the header has 2"),
         ("device,t,t\nd000,1,2\n", "several columns are called t"),
-        ("device,f_max\nd000,1\nd001,1\n", "called 'f_max', as a column of the results"),
-        ("device,u_t\nd000,1\nd001,1\n", "called 'u_t', as a column of the results"),
+        ("device,f_max\nd000,1\nd001,1\n", "called 'f_max', like a column of the results"),
+        ("device,u_t\nd000,1\nd001,1\n", "called 'u_t', like a column of the results"),
         ("device,t\nd000,nan\n", "line 2 has no value for t"),
         ("", "has the columns none"),
     ],
@@ -226,7 +226,7 @@ def test_a_covariate_given_twice_and_fits_of_one_name_are_named(tmp_path):
         (tmp_path / f"{name}.csv").write_text("")
     (tmp_path / "devices.csv").write_text("device,day\na_b,1\na,1\n")
     pattern = f"{tmp_path.as_posix()}/{{device}}-{{day}}.csv"
-    with pytest.raises(DataError, match="day stands in the pattern and in the table"):
+    with pytest.raises(DataError, match="day is in the pattern and in the table"):
         di.campaign(definition(tmp_path, files__pattern=pattern), dry_run=True)
     for place in ("a_b/c", "a/b_c"):
         (tmp_path / place).mkdir(parents=True)

@@ -69,7 +69,7 @@ def test_random_motions_are_those_of_an_independent_integrator(kind, limit, law)
     assert case.error < (max(limit, sharp) if law in cases.KINKS else limit), case.note
 
 
-@pytest.mark.parametrize("law", list(cases.WAYS))
+@pytest.mark.parametrize("law", list(cases.BRANCHES))
 def test_loops_of_any_amplitude_are_those_in_closed_form(law):
     rng = seeded(4, list(cases.LAWS).index(law))
     for _ in range(3):
@@ -300,7 +300,7 @@ def test_even_harmonics_of_a_comparison_of_the_force():
             late = s * f - (s * f - 10.0) * np.exp(-then * (p - kink) / f)
             return np.where(p < kink, early, late)
 
-        return loop_oracles.Way(force, [kink])
+        return loop_oracles.Branch(force, [kink])
 
     top = 15.0
     for _ in range(100):
@@ -333,8 +333,11 @@ def test_derivatives_of_loops_with_a_kink_at_a_speed(law):
             return f - (f - start) * np.exp(-k * softened(path) / f)
 
         kinks = [A - half, A + half]
-        ways = [loop_oracles.Way(lambda path: -along(path), kinks), loop_oracles.Way(along, kinks)]
-        return loop_oracles.harmonics_of(ways, A, orders)
+        branches = [
+            loop_oracles.Branch(lambda path: -along(path), kinks),
+            loop_oracles.Branch(along, kinks),
+        ]
+        return loop_oracles.harmonics_of(branches, A, orders)
 
     system = translate(law_equations(law()))
     arguments = (system, np.array([A]), np.array([omega]), values[None])

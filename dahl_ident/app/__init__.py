@@ -1,8 +1,8 @@
-"""The page for those who do not program: from a file to a signed report, in a browser.
+"""Web pages for users who do not program: from a file to a signed report.
 
-A server on this machine alone shows pages made from the plain files of a folder (`work`). What
-takes time is a command of ``dahl-ident`` in a child process (`work`, `commands`), so that the page
-shows the commands that it ran, and everything can be repeated without it.
+A server that only this machine can reach makes the pages from plain files in a folder (`work`).
+Every task that takes time is a command of ``dahl-ident`` in a child process (`work`, `commands`).
+The pages show these commands, so that everything can be repeated without them.
 """
 
 from dahl_ident.app.server import serve

@@ -1,7 +1,7 @@
 """Contents of files as data for a page: channels, errors, and pictures of points or loops.
 
 It runs in a child process, ``python -m dahl_ident.app.preview``, because an uploaded file may have
-any size and content: it reads the state of a work from standard input and prints JSON.
+any size and content. It reads the content of a ``work.json`` from standard input and prints JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dahl_ident.errors import DahlIdentError
 from dahl_ident.reporting.document import Picture
 from dahl_ident.units import parse_quantity
 
-EMPTY: Mapping[str, Any] = {
+EMPTY_PREVIEW: Mapping[str, Any] = {
     "channels": [],
     "notes": [],
     "pictures": [],
@@ -37,13 +37,13 @@ EMPTY: Mapping[str, Any] = {
     "format": "",
     "sampling": "",
 }
-_CURVE_POINTS = 300  # in a channel's picture
-_MOST_PICTURES = 6  # records that are drawn
+_CURVE_POINTS = 300  # of a channel's curve, at most
+_MOST_PICTURES = 6  # records that are drawn, at most
 
 
 def preview(state: dict[str, Any]) -> dict[str, Any]:
     """Return the channels of the first file, a summary of all data, and errors and warnings."""
-    result: dict[str, Any] = dict(EMPTY, channels=[], notes=[])
+    result: dict[str, Any] = {**EMPTY_PREVIEW, "channels": [], "notes": []}
     files = [str(file["stored"]) for file in state["files"]]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -57,12 +57,15 @@ def preview(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def _add_channels(file: str, result: dict[str, Any]) -> None:
+    """Add format, sampling and notes of a file, and its channels with their roles."""
     source = open_source(file)
     summary = contents(source)
     path = Path("columns.toml")
     text = path.read_text("utf-8") if path.exists() else summary.column_map
     roles: dict[str, Any] = tomllib.loads(text)
-    by_column = {e["column"]: (r, e) for r, e in roles.items() if isinstance(e, dict)}
+    by_column = {
+        entry["column"]: (role, entry) for role, entry in roles.items() if isinstance(entry, dict)
+    }
     result["format"], result["sampling"] = summary.format, summary.sampling
     result["notes"] += [*summary.gaps, *summary.notes]
     for channel, line in zip(source.channels, summary.channels, strict=True):
@@ -106,11 +109,12 @@ def _add_data(files: Sequence[str], reading: dict[str, str], result: dict[str, A
 
 
 def _picture(draw: Callable[[], Any]) -> str:
-    """Return a plot as the address of a PNG image, to be used in HTML."""
+    """Return a plot as the data URL of a PNG image."""
     return Picture("", "", "", draw).address("png")
 
 
 def _hertz(text: str, what: str) -> float:
+    """Return a frequency in Hz; a number without a unit is one."""
     try:
         return float(text)
     except ValueError:
@@ -118,7 +122,7 @@ def _hertz(text: str, what: str) -> float:
 
 
 def _thumbnail(values: Any) -> list[list[float]]:
-    """Return a curve in the unit square; of many samples, the extremes of successive parts."""
+    """Return a curve in the unit square; many samples are reduced to extremes of parts."""
     y = np.asarray(values, dtype=np.float64).ravel()
     y = y[np.isfinite(y)]
     if y.size < 2:

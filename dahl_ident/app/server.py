@@ -37,7 +37,7 @@ from starlette.staticfiles import StaticFiles
 from dahl_ident import reporting
 from dahl_ident.app import commands
 from dahl_ident.app.commands import JobStep, laws, loop_picture
-from dahl_ident.app.preview import EMPTY
+from dahl_ident.app.preview import EMPTY_PREVIEW
 from dahl_ident.app.work import Jobs, Work, new_folder, output
 from dahl_ident.data.storage import save_frame
 from dahl_ident.errors import DahlIdentError
@@ -226,7 +226,7 @@ class App:
         if child.returncode:
             last = child.stderr.decode(errors="replace").strip().splitlines()[-1:]
             error = " ".join(["The files could not be read.", *last])
-            return {**EMPTY, "error": error}
+            return {**EMPTY_PREVIEW, "error": error}
         preview: dict[str, Any] = json.loads(child.stdout)
         for name in ("error", "summary"):
             preview[name] = work.with_uploaded_names(preview[name])

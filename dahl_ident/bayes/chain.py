@@ -1,14 +1,14 @@
 """Markov chains with emcee that run until they converge, and can be stopped and resumed.
 
-The chain depends only on the density, the seed and the settings. Walkers and the state of the
-random generator are carried from step to step, so the number of pieces in which the chain is run
-does not matter; convergence is checked after fixed numbers of steps.
+The chain depends only on the density, the seed and the settings: a chain that is stopped and
+resumed has the same steps as one that is not, because the positions of the walkers and the state of
+the random generator are kept, and convergence is checked after fixed numbers of steps.
 
-The integrated autocorrelation time tau is computed from the paths of single walkers and averaged
-over walkers; the window is Sokal's, the smallest M with M >= 5 tau(M) (as in emcee). N steps of W
-walkers then count as N W/tau independent draws. R-hat compares ensembles, which are independent,
-rather than walkers, which are not; each is split in halves, so that drifts are detected as well
-(Gelman et al., Bayesian Data Analysis, 2013, section 11.4).
+The integrated autocorrelation time tau is computed for each walker and averaged over walkers; the
+window is Sokal's, the smallest M with M >= 5 tau(M) (as in emcee). N steps of W walkers then count
+as N W/tau independent draws. R-hat compares ensembles, which are independent, and not walkers,
+which are not; each ensemble is split into halves, so that drifts are detected as well (Gelman et
+al., Bayesian Data Analysis, 2013, section 11.4).
 """
 
 from __future__ import annotations
@@ -24,12 +24,18 @@ from dahl_ident.bayes.density import LogDensity
 from dahl_ident.bayes.moves import moves_for
 from dahl_ident.errors import ValidationError
 
+# window of the autocorrelation over tau, as in emcee: a shorter one truncates tau, a longer one
+# adds noise
+_WINDOW = 5.0
+_WARM_UP = 10.0  # autocorrelation times after which a chain is independent of its start
+LENGTH = 50.0  # autocorrelation times for a sufficient estimate of tau, as in emcee
+_R_HAT = 1.01  # limit of Vehtari et al. (2021); the older 1.1 accepts chains that differ
 _LEAST_STEPS = 20  # fewest steps for an autocorrelation time
-_FIRST_CHECK = 200  # steps at the first check: three times WARM_UP and LENGTH for tau = 1
-_GROWTH = 1.25  # ratio of steps between checks: at most a quarter more than needed
-_ROUND = 50  # checks are at multiples of this number of steps
-_PIECE = 50  # fewest steps between two calls of the listeners
-_PIECES = 20  # pieces between the calls for a long chain
+_FIRST_CHECK = 200  # steps at the first check: three times _WARM_UP + LENGTH for tau = 1
+_GROWTH = 1.25  # ratio of the steps at successive checks: at most a quarter more than needed
+_CHECK_MULTIPLE = 50  # checks are at multiples of this number of steps
+_SHORTEST_PIECE = 50  # fewest steps between two calls of the listeners
+_PIECES = 20  # of a long chain: a piece is this fraction of the steps so far
 _POOL_PARTS = 8  # parts into which the points of one call are split for a pool
 
 Pool = Any
@@ -95,7 +101,7 @@ class Chain:
 
 
 Listener = Callable[[Chain, "Convergence | None"], None]
-"""Function that is called after each piece with the chain and the last verdict."""
+"""A function that is called after each piece with the chain and the last verdict."""
 
 
 def run(
@@ -105,29 +111,29 @@ def run(
     listeners: Sequence[Listener],
     pool: Pool | None = None,
 ) -> tuple[Chain, Convergence]:
-    """Return the chain, continued until it is long enough, and its convergence verdict."""
+    """Return the chain, continued until it has converged or reached its limit, and the verdict."""
     verdict: Convergence | None = None
     sampler = _sampler(density, settings, pool)
     end = settings.max_steps if settings.steps is None else settings.steps
     while True:
         check = _next_check(chain.steps, end) if settings.steps is None else end
         while chain.steps < check:
-            piece = max(_PIECE, chain.steps // _PIECES)
+            piece = max(_SHORTEST_PIECE, chain.steps // _PIECES)
             chain = _continued(sampler, chain, min(piece, check - chain.steps))
             for listener in listeners:
                 listener(chain, verdict)
         verdict = judge(chain.points, settings.ensembles, settings.ess)
-        if chain.steps >= end or verdict.reached:
+        if chain.steps >= end or verdict.converged:
             return chain, verdict
-        # the next check must come after this one
-        chain = _continued(sampler, chain, min(_PIECE, end - chain.steps))
+        # more steps, without which the next check would be this one again
+        chain = _continued(sampler, chain, min(_SHORTEST_PIECE, end - chain.steps))
 
 
 def _next_check(steps: int, end: int) -> int:
     """Return the first number of steps, at least `steps`, after which convergence is judged."""
     check = _FIRST_CHECK
     while check < steps:
-        check = int(np.ceil(_GROWTH * check / _ROUND)) * _ROUND
+        check = int(np.ceil(_GROWTH * check / _CHECK_MULTIPLE)) * _CHECK_MULTIPLE
     return min(check, end)
 
 
@@ -164,14 +170,6 @@ def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:
     return replace(chain, points=points, log_density=log_density, random_state=last.random_state)
 
 
-# window of the autocorrelation over tau, as in emcee: a shorter one truncates tau, a longer one
-# adds noise
-WINDOW = 5.0
-WARM_UP = 10.0  # autocorrelation times after which a chain is independent of its start
-LENGTH = 50.0  # autocorrelation times for a sufficient estimate of tau, as in emcee
-R_HAT = 1.01  # limit of Vehtari et al. (2021); the older 1.1 accepts chains that differ
-
-
 @dataclass(frozen=True)
 class Convergence:
     """The verdict on one chain."""
@@ -201,14 +199,14 @@ class Convergence:
                 f"{kept} steps after warm-up are {kept / self.tau.max():.0f} autocorrelation "
                 f"times, expected {LENGTH:.0f}"
             )
-        if not self.r_hat.max() < R_HAT:
-            unmet.append(f"R-hat is {self.r_hat.max():.3f}, expected below {R_HAT}")
+        if not self.r_hat.max() < _R_HAT:
+            unmet.append(f"R-hat is {self.r_hat.max():.3f}, expected below {_R_HAT}")
         if self.ess.min() < self.required:
             unmet.append(f"{self.ess.min():.0f} effective draws, expected {self.required:.0f}")
         return unmet
 
     @property
-    def reached(self) -> bool:
+    def converged(self) -> bool:
         """Whether all criteria are met."""
         return not self.unmet
 
@@ -218,7 +216,7 @@ def judge(chain: FloatArray, ensembles: int, required: float) -> Convergence:
     steps = len(chain)
     first = autocorrelation_time(chain[steps // 2 :])
     longest = np.nanmax(first) if np.isfinite(first).any() else steps
-    discard = min(int(np.ceil(WARM_UP * longest)), steps // 2)
+    discard = min(int(np.ceil(_WARM_UP * longest)), steps // 2)
     kept = chain[discard:]
     tau = autocorrelation_time(kept)
     ess = kept.shape[0] * kept.shape[1] / tau
@@ -235,7 +233,7 @@ def autocorrelation_time(chain: FloatArray) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         rho = np.mean(correlation / correlation[0], axis=1)
     taus = 2.0 * np.cumsum(rho, axis=0) - 1.0
-    enough = np.arange(steps)[:, None] >= WINDOW * taus
+    enough = np.arange(steps)[:, None] >= _WINDOW * taus
     window = np.where(enough.any(axis=0), enough.argmax(axis=0), steps - 1)
     return np.asarray(np.take_along_axis(taus, window[None], axis=0)[0])
 

@@ -45,12 +45,12 @@ from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.data.columns import one_of
 from dahl_ident.errors import FitError, SamplingError, ValidationError, argument
 from dahl_ident.fitting import solve
+from dahl_ident.fitting.losses import TAIL_DOF
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
-TAIL_DOF = 4.0  # degrees of freedom of Student's t: heavy tails, but a finite variance
 _LARGEST_LOG_MISFIT = 300.0  # largest ln s, against overflow of s^2
 Sums = Callable[[FloatArray], FloatArray]
 _COLUMNS = (  # of a table, on which its likelihood depends

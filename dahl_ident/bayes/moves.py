@@ -1,30 +1,29 @@
 r"""Proposals for several independent ensembles, all evaluated in one call.
 
-Each ensemble of walkers is split at random into halves; one half moves with the other as its guide,
-then they exchange roles (as in emcee, whose sampler runs these moves). The halves of all ensembles
-are evaluated in one call, which is fastest.
+Each ensemble of walkers is split at random into halves. The walkers of one half move, with
+proposals made from the positions of the other half, the guide; then the halves exchange roles (as
+in emcee, whose sampler runs these moves). Evaluating all ensembles in one call is fastest.
 
-- `differential_evolution`: a walker moves along the difference of two of the other half, by
-  2.38/(2 D)^(1/2) of it, sometimes by all of it, which leads from mode to mode (ter Braak,
+- `differential_evolution`: a walker moves along the difference of two walkers of the guide, by
+  2.38/(2 D)^(1/2) of it, and sometimes by all of it, which leads from mode to mode (ter Braak,
   Statistics and Computing 16, 2006; Nelson et al., ApJS 210, 2014).
-- `snooker`: along the line to a walker of the other half, by the projected difference of two more
-  (ter Braak and Vrugt, Statistics and Computing 18, 2008).
-- `independent`: to a draw from Student's t around the mean of the other half, shaped by its
-  covariance; in few dimensions many draws are accepted, successive positions are nearly
-  independent, and heavy tails are reached.
+- `snooker`: a walker moves along the line to a walker of the guide, by the projected difference of
+  two others (ter Braak and Vrugt, Statistics and Computing 18, 2008).
+- `independent`: a walker moves to a draw from Student's t with the mean and the covariance of the
+  guide. In few dimensions many draws are accepted, successive positions are nearly independent, and
+  heavy tails are reached.
 
-Decorrelated coordinates, in which the posterior ridges of plants are straight.
+**Decorrelation.** The data determine the sum of the stiffnesses of a spring and of friction in
+parallel. If they do not determine f_max and sigma, the density has a curved ridge, which straight
+steps leave. Proposals are therefore made in coordinates in which the ridge is straight. The
+dependence of the linear parameters l on the friction is estimated by weighted least squares: the
+describing function N(p) of the law with parameters p is fitted by the columns G of spring, damper
+and mass, at the amplitudes and with the weights w of the data. The coordinates that replace l are
 
-The data determine the sum of the stiffnesses of a spring and of friction in parallel. If they do
-not determine f_max and sigma, the density has a curved ridge, which straight steps leave. The
-dependence of the linear parameters l on friction is estimated by weighted least squares of the
-describing function N(p), of any law with parameters p, on the columns of spring, damper and mass,
-at the amplitudes and with the weights of the data:
+    phi = l + W N(p),    W = (G' w^2 G)^-1 G' w^2,
 
-    phi = l + W N(p),    W = (G' w^2 G)^-1 G' w^2.
-
-phi is the combination that the data determine. For given friction it is l with a shift, so volumes
-are preserved and the density over phi equals the density over l.
+the combination that the data determine. At constant p, phi is l with a shift, so volumes are
+preserved and the density over phi equals the density over l.
 """
 
 from __future__ import annotations
@@ -41,11 +40,11 @@ from dahl_ident.problem import TableProblem
 
 Random = np.random.RandomState  # emcee's
 Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArray]]
-"""From half and guide, (ensembles, W/2, D), to proposed points and ln of the Hastings factor."""
+"""From half and guide, (ensembles, W/2, D), to proposals and ln of their Hastings factors."""
 
-_JITTER = 1e-5  # relative scatter of a step, against lattices of walkers
-_JUMP = 0.1  # share of the steps of the full difference of two walkers
-_TAIL = 2.0  # degrees of freedom of the independent proposals: few, for heavy tails
+_JITTER = 1e-5  # relative scatter of a step, so that walkers do not form a lattice
+_JUMP = 0.1  # share of the steps that are the full difference of two walkers
+_PROPOSAL_DOF = 2.0  # degrees of freedom of the independent proposals: few, for heavy tails
 _SNOOKER = 1.7  # length of a snooker step: the mean of ter Braak and Vrugt's range, as in emcee
 _OUTSIDE_PRIORS = 1e300  # replaces a shift that is not finite; outside any prior
 
@@ -54,10 +53,10 @@ _OUTSIDE_PRIORS = 1e300  # replaces a shift that is not finite; outside any prio
 class Decorrelation:
     """The shift of the linear parameters; made by :func:`decorrelation_of`."""
 
-    problem: TableProblem | None  # its theta, (S, P), is first in the points, (S, D)
+    problem: TableProblem | None  # points (S, D) begin with its theta (S, P); None for no shift
     friction: tuple[Element, ...]  # the nonlinear elements with free parameters
-    linear: IntArray  # (L,) coordinates in which the force of linear elements is linear
-    projection: FloatArray  # (2 n, L) from Re N and Im N at every row to the shift
+    linear: IntArray  # (L,) indices of the coordinates l
+    projection: FloatArray  # (2 n, L) from Re N and Im N of every row to the shift
 
     def decorrelated(self, x: FloatArray) -> FloatArray:
         """Return points with phi instead of l."""
@@ -171,7 +170,7 @@ def independent(
     correlation = covariance / size / size.swapaxes(1, 2)
     root = np.linalg.cholesky(correlation + 1e-9 * np.eye(dims))
     normal = random.standard_normal(half.shape)
-    chi = np.sqrt(random.chisquare(_TAIL, size=half.shape[:-1]) / _TAIL)
+    chi = np.sqrt(random.chisquare(_PROPOSAL_DOF, size=half.shape[:-1]) / _PROPOSAL_DOF)
     draws = normal / chi[..., None]
     points = mean + size * (draws @ root.swapaxes(1, 2))
     current = np.linalg.solve(root, ((half - mean) / size).swapaxes(1, 2)).swapaxes(1, 2)
@@ -180,7 +179,9 @@ def independent(
 
 def _log_t(z: FloatArray) -> FloatArray:
     """Return ln of the density of Student's t up to a constant."""
-    return np.asarray(-0.5 * (_TAIL + z.shape[-1]) * np.log1p(np.sum(z**2, axis=-1) / _TAIL))
+    return np.asarray(
+        -0.5 * (_PROPOSAL_DOF + z.shape[-1]) * np.log1p(np.sum(z**2, axis=-1) / _PROPOSAL_DOF)
+    )
 
 
 def _partners(half: FloatArray, guide: FloatArray, random: Random, count: int) -> list[FloatArray]:
@@ -188,7 +189,7 @@ def _partners(half: FloatArray, guide: FloatArray, random: Random, count: int) -
     ensembles, n, _ = half.shape
     size = guide.shape[1]
     chosen = [random.randint(size, size=(ensembles, n))]
-    for k in range(1, count):  # a draw among the others, shifted past those taken
+    for k in range(1, count):  # a draw from those not yet chosen, whose indices skip the chosen
         index = random.randint(size - k, size=(ensembles, n))
         for taken in np.sort(np.stack(chosen), axis=0):
             index = index + (index >= taken)

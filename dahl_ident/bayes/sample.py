@@ -62,7 +62,7 @@ class ChainSample:
     @property
     def converged(self) -> bool:
         """Whether the chain is long enough to be used."""
-        return self.convergence.reached
+        return self.convergence.converged
 
     @property
     def message(self) -> str:

@@ -1,6 +1,6 @@
 """Definition of a campaign: a declarative file, checked before anything runs.
 
-    laws = "my_laws.py"            # optional: a file of your own laws, or several; it is run
+    laws = "my_laws.py"            # optional: a Python file with your laws, or a list; it is run
 
     [files]
     pattern = "data/{device}/{run}_{tension}lb.csv"   # names in braces are read from the path
@@ -35,6 +35,7 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ _KINDS = ("record", "response")
 _UNITS = ("device", "run")
 _SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "progress"}
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)\}")
+# columns of the table of results, and the beginnings of their names; covariates have other names
 _COLUMNS = {
     "device",
     "run",
@@ -66,7 +68,6 @@ _COLUMNS = {
     "key",
 }
 _PREFIXES = ("u_", "U_", "dof_", "unit_", "posterior_")
-"""Columns of the table of results, whose names covariates cannot have."""
 _BLANK = ("", "na", "n/a", "nan")
 
 
@@ -74,8 +75,8 @@ _BLANK = ("", "na", "n/a", "nan")
 class Task:
     """One fit of a campaign."""
 
-    device: str  # labels; `run` is empty where the fit takes all runs of the device
-    run: str
+    device: str  # label
+    run: str  # label; empty if the fit takes all runs of the device
     files: tuple[Path, ...]  # in the order of the runs
     runs: tuple[str, ...]  # label of each file
     covariates: Mapping[str, float | str]  # from the path and from the table of covariates
@@ -107,8 +108,8 @@ class Definition:
 def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
     """Return a checked campaign from a TOML file, or from its content.
 
-    Every file exists and every covariate is known; the paths of a mapping are relative to the
-    working folder.
+    All files exist and all covariates are known. Paths in a mapping are relative to the working
+    folder.
     """
     if isinstance(source, Mapping):
         content, name, folder = dict(source), "the campaign", Path.cwd()
@@ -222,18 +223,17 @@ def _check_options(options: Mapping[str, Any]) -> None:
         json.dumps(options)
     except TypeError as exc:
         raise ValidationError(
-            f"a date or time stands where an option has none; expected a number or a text "
-            f"in quotes ({exc})"
+            f"an option is a date or a time; expected a number or a text in quotes ({exc})"
         ) from exc
 
 
 def _check_names(tasks: Sequence[Task], parameters: Collection[str]) -> None:
-    """Refuse covariates named like a column of the results, and two fits of the same name."""
+    """Refuse covariates with the name of a column of the results, and fits with the same name."""
     reserved = _COLUMNS | set(parameters)
     for column in {column for task in tasks for column in task.covariates}:
         if column in reserved or column.startswith(_PREFIXES):
             raise ValidationError(
-                f"a covariate is called {column!r}, as a column of the results; give it "
+                f"a covariate is called {column!r}, like a column of the results; give it "
                 "another name"
             )
     for first, second in pairwise(sorted(tasks, key=lambda task: task.name)):
@@ -266,19 +266,19 @@ def _tasks(folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]
             )
         if both := fields.keys() & row.keys():
             raise ValidationError(
-                f"{', '.join(sorted(both))} stands in the pattern and in the table of "
-                "covariates; leave it out of one"
+                f"{', '.join(sorted(both))} is in the pattern and in the table of covariates; "
+                "leave it out of one of them"
             )
         values = {key: _value(text) for key, text in fields.items()} | row
         runs[device, run] = Task(device, run, (path,), (run,), values)
     if per == "run":
         return tuple(task for _, task in sorted(runs.items()))
-    of_devices = groupby(sorted(runs.values(), key=lambda t: t.device), key=lambda t: t.device)
-    return tuple(_joined(device, list(tasks)) for device, tasks in of_devices)
+    by_device = sorted(runs.values(), key=attrgetter("device"))
+    return tuple(_joined(d, list(tasks)) for d, tasks in groupby(by_device, attrgetter("device")))
 
 
 def _joined(device: str, runs: list[Task]) -> Task:
-    """Return one fit of several runs, with the covariates that they have in common."""
+    """Return one fit of all runs of a device, with the covariates that the runs share."""
     shared = {
         name: value
         for name, value in runs[0].covariates.items()
@@ -296,7 +296,7 @@ def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
             f"the pattern {pattern!r} has no {{device}}; put it where the path names it"
         )
     if len(set(fields)) < len(fields):
-        raise ValidationError(f"the pattern {pattern!r} names a field twice")
+        raise ValidationError(f"the pattern {pattern!r} has the same field twice")
     parts = _FIELD.split(pattern)
     if any(brace in part for part in parts[::2] for brace in "{}"):
         raise ValidationError(

@@ -1,8 +1,8 @@
 """The public function that runs the missing fits of a campaign and writes its table.
 
-The journal has one line for each fit; the table is made from the lines. Only the last line can be
-incomplete, after a crash; it is dropped when the file is opened again. Only keys and positions of
-lines are held in memory.
+The journal has one line for each fit, and the table is made from these lines. After a crash the
+last line may be incomplete; it is dropped when the file is opened again. Only the keys and the
+positions of the lines are held in memory.
 """
 
 from __future__ import annotations
@@ -56,15 +56,14 @@ if TYPE_CHECKING:
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
 _TRIAL_FITS = 3  # fits that show whether the options of a new campaign can be used at all
-_ROWS_AT_ONCE = 2000
-"""Rows that are in memory as dictionaries, which are ten times as large as in a table."""
+_ROWS_AT_ONCE = 2000  # rows held as dictionaries, which take ten times the memory of a table
 _JOURNAL_ONLY = ("key", "retry", "refused")
 _FIRST_COLUMNS = ("device", "run", "status", "error", "statements")
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """The results of a campaign, or after a dry run the fits that it would run.
+    """The results of a campaign, or after a dry run the list of fits that it would run.
 
     Attributes
     ----------
@@ -75,7 +74,7 @@ class Campaign:
     to_do : tuple of str
         Fits that were missing, or whose files had changed; done unless this was a dry run.
     statuses : mapping of str to int
-        How many fits ended with each status, "failed" among them.
+        Number of fits that ended with each status, "failed" included.
 
     Examples
     --------
@@ -170,17 +169,17 @@ def campaign(
 ) -> Campaign:
     """Read, extract and fit the files of many devices; one row of a table for each fit.
 
-    Results are keyed by everything that they depend on: the digests of the files, the options and
-    the version. If it is run again after an interruption, only the missing fits are computed; after
-    a file has changed, only the fits that depend on that file.
+    The key of a result is a digest of everything that it depends on: the files, the options and the
+    version. When a campaign is run again, only missing fits are computed, and those whose files
+    have changed.
 
     Parameters
     ----------
     source : path or mapping
         TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
     jobs : int, optional
-        Processes of this machine, with one numerical thread each; by default as many as there
-        are processors. Elsewhere: the number of fits at a time.
+        Number of processes on this machine, with one numerical thread each; by default the number
+        of processors. With an executor or a scheduler: the number of fits at a time.
     executor : concurrent.futures.Executor, optional
         Runs the fits instead.
     scheduler : str, optional
@@ -193,8 +192,8 @@ def campaign(
         the memory of the machine shared between the jobs, at least 2 GB; elsewhere that of the
         worker's machine.
     patience : float, default 120
-        Seconds for which the scheduler or the executor may not answer; of an executor, in
-        addition to the limit of time for a device.
+        Seconds without an answer after which the scheduler or the executor is given up; for an
+        executor they are counted from the end of `timeout`.
     send_files : bool, default False
         Send the contents of the files to workers that cannot access the paths.
     dry_run : bool, default False
@@ -226,8 +225,8 @@ def campaign(
 
     Notes
     -----
-    Each fit runs in a separate process. To define the laws of a script there, the script is run
-    once more, so it must call this under ``if __name__ == "__main__":``.
+    Each fit runs in a separate process. If the model has laws that a script defines, that process
+    runs the script again, so the script must call this under ``if __name__ == "__main__":``.
 
     Examples
     --------
@@ -254,7 +253,7 @@ def campaign(
     if dry_run:
         tasks = _by_key(definition)
         agree = _options_agree(definition, redo)
-        return _split(definition, tasks, finished(folder / _JOURNAL)[0] if agree else ())
+        return _before(definition, tasks, read_journal(folder / _JOURNAL)[0] if agree else ())
     make_folder(folder)
     lost: LostError | None = None
     with locked(folder / _JOURNAL, DataError):
@@ -262,7 +261,7 @@ def campaign(
         with closing(Journal(folder / _JOURNAL)) as journal:
             limits = Limits(timeout, memory, journal.seconds)
             tasks = _by_key(definition)
-            outcome = _split(definition, tasks, journal.places)
+            before = _before(definition, tasks, journal.places)
             missing = [key for key in tasks if key not in journal.places]
             work = ((key, _job(definition, tasks[key], send_files, laws)) for key in missing)
             if scheduler is not None:
@@ -295,7 +294,7 @@ def campaign(
             f"{lost}; {len(available)} of {len(tasks)} fits are in {folder / 'results.csv'}, and "
             "the same command does the others"
         ) from lost
-    return replace(outcome, statuses=statuses)
+    return replace(before, statuses=statuses)
 
 
 def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
@@ -321,9 +320,9 @@ def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
 def _unless_refused(
     done: Iterator[tuple[_Tag, Row]], trials: int, source: str
 ) -> Iterator[tuple[_Tag, Row]]:
-    """Pass rows on, unless the first `trials` all say that the options or the model are wrong.
+    """Pass rows on; raise an error if the first `trials` all refuse the options or the model.
 
-    One such row proves nothing: an option may not suit the data of one device.
+    One such row is not enough: the options may be wrong for the data of one device only.
     """
     first: list[tuple[_Tag, Row]] = []
     for tagged in done:
@@ -344,12 +343,11 @@ def _table_row(task: Task, row: dict[str, Any]) -> dict[str, Any]:
     return {**labels, **task.covariates, **row, "version": __version__}
 
 
-def _split(definition: Definition, tasks: Mapping[str, Task], keys: Container[str]) -> Campaign:
-    done, to_do = (
-        tuple(task.name for key, task in tasks.items() if (key in keys) == is_finished)
-        for is_finished in (True, False)
-    )
-    return Campaign(definition.folder, done, to_do, {})
+def _before(definition: Definition, tasks: Mapping[str, Task], keys: Container[str]) -> Campaign:
+    """Return the campaign before it runs, with the results of some keys."""
+    finished = tuple(task.name for key, task in tasks.items() if key in keys)
+    to_do = tuple(task.name for key, task in tasks.items() if key not in keys)
+    return Campaign(definition.folder, finished, to_do, {})
 
 
 def _job(
@@ -371,7 +369,7 @@ def _options(definition: Definition) -> bytes:
 
 
 def _options_agree(definition: Definition, redo: bool) -> bool:
-    """Return whether the folder holds results with these options; refuse others without `redo`."""
+    """Return whether the folder holds results with these options; others need `redo`."""
     path = definition.folder / "options.json"
     if not path.exists():
         return False
@@ -425,11 +423,11 @@ def _by_key(definition: Definition) -> dict[str, Task]:
 
 
 class Journal:
-    """The lines of one campaign: the position of each finished key's line, and the fits' times."""
+    """The journal of one campaign: positions of lines by key, and the seconds of each fit."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.places, self.seconds, end = finished(path)
+        self.places, self.seconds, end = read_journal(path)
         try:
             self._file: IO[bytes] = path.open("r+b" if path.exists() else "w+b")
             self._file.truncate(end)
@@ -438,7 +436,7 @@ class Journal:
             raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
 
     def add(self, key: str, row: Mapping[str, Any]) -> None:
-        """Append one result; it has been passed to the operating system when this returns."""
+        """Append one result, and pass it to the operating system."""
         line = json.dumps({"key": key, **row}, ensure_ascii=False).encode() + b"\n"
         self.places[key] = self._file.tell()
         self._file.write(line)
@@ -456,11 +454,11 @@ class Journal:
         self._file.close()
 
 
-def finished(path: Path) -> tuple[dict[str, int], list[float], int]:
+def read_journal(path: Path) -> tuple[dict[str, int], list[float], int]:
     """Return the position of each finished key's line, seconds, and the end of the last line.
 
-    A fit whose failure may have another cause than its device is not finished: a process or a
-    worker that died, files that a worker does not see, a limit of time or memory.
+    A fit that may have failed because of something other than its device is not finished: a process
+    or a worker that died, files that a worker cannot access, a limit of time or memory.
     """
     places: dict[str, int] = {}
     seconds: list[float] = []

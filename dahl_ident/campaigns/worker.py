@@ -2,8 +2,8 @@
 
 Each fit has a separate process, whether it runs on this machine, in a thread of an executor or on
 a worker of a cluster. A fit that hangs, needs too much memory or kills its process therefore ends
-as a row, and nothing else is lost. Jobs go through standard input and rows come back through
-standard output, as pickles; of the calling script, only the files of its laws are imported.
+as a row, and nothing else is lost. Jobs are sent through standard input and rows returned through
+standard output, as pickles. The calling script is not imported, only the files of its laws.
 Numerical libraries are imported inside functions, so that this module loads quickly.
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_DEATHS = 3  # worker processes that may die on one job before the job is taken as the cause
+_DEATHS = 3  # worker processes that may die on a job before the job itself is taken as the cause
 _START = "import sys; sys.path[:] = {!r}; from dahl_ident.campaigns.worker import serve; serve()"
 
 
@@ -64,10 +64,11 @@ class UnseenError(DataError):
 def failed(error: str, *, retry: bool = False, refused: bool = False, seconds: float = 0.0) -> Row:
     """Return the row of a fit that failed.
 
-    With `retry`, the same command tries it again; `refused`: the options or the model are wrong.
+    With `retry`, running the campaign again repeats it; `refused` says that the options or the
+    model are wrong.
     """
-    row: Row = {"status": "failed", "error": error, "digests": [], "seconds": seconds}
-    return row | {name: True for name, is_set in (("retry", retry), ("refused", refused)) if is_set}
+    row = {"status": "failed", "error": error, "digests": [], "seconds": seconds}
+    return row | {"retry": retry, "refused": refused}
 
 
 def do(job: Job) -> Row:
@@ -102,6 +103,7 @@ def do(job: Job) -> Row:
 
 
 def _fitted(job: Job, digests: list[str]) -> Row:
+    """Return the row of a fit; write its report, and append the digests of its files."""
     from dahl_ident.elements.element import model_from_description
     from dahl_ident.results import fit, posterior
 
@@ -212,7 +214,7 @@ class _Process:
         )
 
     def do(self, job: Job, seconds: float, memory: float | None) -> Row | None:
-        """Return the row of a job, None if the process died; it is killed after so many seconds."""
+        """Return the row of a job; None if the process died. It is killed after `seconds`."""
         content = pickle.dumps((job, memory))
         timed_out = threading.Event()
 
@@ -282,6 +284,7 @@ def do_within(job: Job, seconds: float, memory: float | None) -> Row:
 
 @contextmanager
 def _borrowed() -> Iterator[_Process]:
+    """Yield an idle process, or a new one; it is idle again afterwards if it is alive."""
     process = _idle.pop() if _idle else _Process()
     if process.path != sys.path:  # it may not find the modules of laws
         process.end()

@@ -46,9 +46,10 @@ _UNITS = {
     "acceleration": "m/s^2",
 }
 _RANGE = "the highest value, or lowest:highest"
-# levels if none are stated
-_LEVEL_RANGE = (0.1, 10.0)  # over the displacement, or the force, at the knee of the friction
-_NUM_LEVELS = 30  # 15 in a decade, as in the shipped data sets
+# default levels: lowest and highest over displacement or force at the knee, and their number (15
+# in a decade, as in the shipped data sets)
+_LEVEL_RANGE = (0.1, 10.0)
+_NUM_LEVELS = 30
 
 
 @dataclass(frozen=True)
@@ -101,15 +102,15 @@ class Aim:
 
     panel: ClassVar[str] = "Aim"
     target: list[str] | None = setting(
-        "Wanted relative standard uncertainty, f_max=0.02 or f_max/sigma=0.02, or expanded one, "
-        "'U(f_max)=0.04', in the least time; a name alone: least uncertainty in --time. "
-        "Repeatable; by default all parameters."
+        "Relative standard uncertainty to be met in the least time, f_max=0.02 or "
+        "f_max/sigma=0.02, or an expanded one, 'U(f_max)=0.04'; a name alone is given the least "
+        "uncertainty within --time. Repeatable; by default all parameters."
     )
     ranges: list[str] | None = setting(
         "Range of a parameter with 95 % probability, f_max=0.05:0.2N; repeatable."
     )
     suspects: list[str] | None = setting(
-        "Parameter that may be needed, and the uncertainty wanted for it, alpha=0.1."
+        "Parameter that the model may need, and its target uncertainty, alpha=0.1; repeatable."
     )
 
     def keywords(self) -> dict[str, Any]:
@@ -169,7 +170,7 @@ def plan(
     if sample_rate is None and (waveform is not None or bench.motion is not None):
         raise ValidationError("--waveform and --motion need --sample-rate, Hz; give it")
     if sample_rate is not None and waveform is None and bench.motion is None:
-        raise ValidationError("--sample-rate is that of --waveform or --motion; give one of them")
+        raise ValidationError("--sample-rate needs --waveform or --motion; give one of them")
     result = make_plan(
         _fit_or_model(fit, model),
         limits=bench.limits(),
@@ -222,6 +223,7 @@ def _pair(option: str, text: str) -> tuple[str, str]:
 
 
 def _noise(text: str | None) -> Any:
+    """Return a relative noise, or noise by name, as ``plan`` takes it."""
     if text is None:
         return None
     if "=" not in text:
@@ -290,7 +292,7 @@ class Errors:
         """Return the standard deviation of a channel, relative if the unit is 1."""
         text = getattr(self, f"{channel}_std")
         try:
-            return number("it", text, unit)
+            return number(channel, text, unit)
         except (ModelError, UnitError) as exc:
             expected = f"the noise of samples, such as 5e-6 or 5u{unit}"
             if unit == "1":
@@ -369,12 +371,12 @@ def _default_levels(truth: Element, controlled: str) -> str:
     laws = [e for e in as_model(truth).elements if not e.is_linear]
     knees = np.array([[float(knee) for knee in e.knee(e.known_values())] for e in laws])
     if controlled == "force":
-        # the bounds are of the fundamental: that of a square wave is 4/pi times its amplitude
+        # bounds of the fundamental, which for a square wave is 4/pi times its amplitude
         limits = [0.25 * np.pi * float(e.force_bounds(e.known_values())[1]) for e in laws]
         knees = np.array([[sum(limits)] * 2])
     low, high = (knees[:, 0].min(), knees[:, 1].max()) if laws else (0.0, 0.0)
     if not (np.isfinite([low, high]).all() and 0.0 < low <= high):
-        raise ValidationError("the plant has no knee to place levels about; give --levels")
+        raise ValidationError("the plant has no knee, around which levels would be; give --levels")
     return f"{_LEVEL_RANGE[0] * low}:{_LEVEL_RANGE[1] * high}:{_NUM_LEVELS}"
 
 

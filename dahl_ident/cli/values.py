@@ -18,9 +18,10 @@ _QUANTITY = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\s\d.,]?.*?)\s*"
 
 
 def number(name: str, text: str, unit: str | None = None, *, or_free: bool = False) -> float:
-    """Return a number in SI, or one with its unit, ``50um``; by default the parameter has it.
+    """Return a value in SI units; the text may state a unit, ``50um``.
 
-    With `or_free`, the error says that the parameter may be free as well.
+    It has the dimension of `unit`, or else of the parameter called `name`. With `or_free`, the
+    error says that the parameter may be free as well.
     """
     share = unit == "1" and text.rstrip().endswith("%")
     try:
@@ -36,7 +37,7 @@ def number(name: str, text: str, unit: str | None = None, *, or_free: bool = Fal
 
 
 def _quantity(name: str, text: str, unit: str | None) -> float:
-    """Return a number with its unit in SI; NaN for other text."""
+    """Return the SI value of a number with a unit; NaN for other text."""
     if _QUANTITY.fullmatch(text) is None:
         return math.nan
     from dahl_ident.elements.element import KINDS
@@ -57,12 +58,14 @@ def _quantity(name: str, text: str, unit: str | None) -> float:
 
 
 def numbers(name: str, text: str, unit: str | None = None, sep: str = ":") -> list[float]:
-    """Return the numbers of ``1:50um``; a unit after the last holds for those without one."""
+    """Return the numbers of ``1:50um``; the unit of the last holds for those without one."""
     parts = text.split(sep)
-    read = [_QUANTITY.fullmatch(part) for part in parts]
-    last = read[-1][2] if read[-1] else ""
-    parts = [f"{q[1]}{q[2] or last}" if q else part for q, part in zip(read, parts, strict=True)]
-    return [number(name, part, unit) for part in parts]
+    matches = [_QUANTITY.fullmatch(part) for part in parts]
+    last_unit = matches[-1][2] if matches[-1] else ""
+    return [
+        number(name, f"{match[1]}{match[2] or last_unit}" if match else part, unit)
+        for match, part in zip(matches, parts, strict=True)
+    ]
 
 
 def ends(name: str, text: str, unit: str | None = None) -> float | tuple[float, float]:

@@ -29,12 +29,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.bayes.density import TAIL_DOF, Density
+from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data.storage import library
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.fitting.losses import TAIL_DOF
 
 if TYPE_CHECKING:
     from dahl_ident.results.fit_result import FitResult
