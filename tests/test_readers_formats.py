@@ -241,8 +241,8 @@ class TestMatlab:
 
     def test_all_structs_of_an_array(self, matlab):
         columns = {
-            "frequency": {"column": "sweep.levels[*].f", "unit": "Hz"},
-            "response": {"column": "sweep.levels[*].H", "unit": "m/N"},
+            "frequency": "sweep.levels[*].f [Hz]",
+            "response": "sweep.levels[*].H [m/N]",
             "drive": {"column": "sweep.levels[*].u0", "unit": "N"},
             "controlled": {"force": "*0?", "displacement": "*[12]?"},
         }

@@ -1,6 +1,7 @@
 """Tables of response: every form they come in, doubts about them, many files into one."""
 
 import math
+import tomllib
 import warnings
 
 import numpy as np
@@ -603,6 +604,17 @@ class TestInspect:
         for names, role in (("f,x_um,K", "frequency"), ("t,x,f", "force"), ("x,y,f", "force")):
             path.write_text(f"{names}\n1,100,29.9\n2,900,28.4\n")
             assert f'[{role}]\ncolumn = "f"' in inspect(path).column_map
+        path.write_text("f,A,gain,phase\n1,100,29.9,3\n2,900,28.4,5\n")  # not an acceleration
+        proposed = tomllib.loads(inspect(path).column_map)
+        named = {role: entry["column"] for role, entry in proposed.items()}
+        assert named == {"frequency": "f", "amplitude": "A", "gain": "gain", "phase": "phase"}
+
+    def test_a_frequency_of_another_name_is_not_taken_as_one_hertz(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text("Frequenz [Hz],amplitude [m],gain [N/m],phase [deg]\n5,1,1,10\n5,2,1,20\n")
+        with pytest.raises(DataError, match="no column holds the frequency"):
+            read_frequency_response(path)
+        assert read_frequency_response(path, frequency=5).frequency_hz.tolist() == [5.0, 5.0]
 
     def test_missing_units_are_left_to_fill_in(self, tmp_path):
         path, columns = tmp_path / "a.csv", tmp_path / "lab.toml"

@@ -417,6 +417,6 @@ def by_level(source: RawFile, columns: ColumnMap) -> dict[str | None, ColumnMap]
             )
     maps: dict[str | None, ColumnMap] = {}
     for label in levels[first]:
-        roles = {r: replace(c, column=levels[r][label].name) for r, c in starred.items()}
+        roles = {r: replace(c, column=levels[r][label].header) for r, c in starred.items()}
         maps[label] = replace(columns, roles={**columns.roles, **roles})
     return maps

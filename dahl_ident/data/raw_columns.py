@@ -44,7 +44,7 @@ _CODE_RATIO = 5.0  # a code for a missing value exceeds every measured number by
 _FEWEST_VALUES = 4  # with fewer, a value far from the others may be measured
 _LONGEST_WORD = 200  # letters of a label, time stamp or number
 _LONGEST_HEADER = 400  # letters of a cell with name and unit
-_INDEX = re.compile(r"[\d:, ]+")
+_INDEX = re.compile(r"[\d:, *]+")
 # F / N, according to ISO 80000, or F, N
 _UNBRACKETED = re.compile(r"\s*(.*\S)(?:\s+(?:/|in)|,)\s+(\S.*)")
 _CURVED = re.compile(r"\s*(.*?\S)\s*\((.*)\)\s*")
@@ -202,6 +202,9 @@ class RawFile:
 
     def matching(self, pattern: str) -> dict[str, RawChannel]:
         """Return the channels that a path with ``*`` matches, by the part that varies."""
+        path, unit = split_header(pattern)
+        if unit is not None and "*" in path:
+            return {k: replace(c, unit=unit) for k, c in self.matching(path).items()}
         parts = re.fullmatch(r"(|.*?[./])([^./]*\*(?:.*\*)?[^.*/]*)([./][^*]*|)", pattern)
         assert parts is not None  # callers pass patterns with a star
         before, varying, after = (

@@ -227,7 +227,7 @@ class _TableBinding(Binding):
 
     def _add_stated(self) -> None:
         """Add a column for each of frequency, amplitude and drive that is stated for all rows."""
-        options, sweep = self.options, self.map.sweep
+        options, sweep, channels = self.options, self.map.sweep, self.source.channels
         roles = ("frequency", *(role for form in _FORMS for role in form))
         rows = next((c.size for role in roles if (c := self.channel(role)) is not None), 0)
         if sweep is not None:
@@ -236,11 +236,12 @@ class _TableBinding(Binding):
         hertz = options.frequency
         if not self.has("frequency"):
             self._refuse_waveforms()
-            if hertz is None and rows and not self.has("amplitude"):
+            in_hertz = any(RESPONSE_COLUMNS["frequency"].accepts(c.unit, c.name) for c in channels)
+            if hertz is None and rows and (in_hertz or not self.has("amplitude")):
                 raise ValidationError(
                     "no column holds the frequency (inspect proposes a column map); name it with "
                     f"{column_map_of({'frequency': ANY})}, or say what was swept, such as "
-                    f"{argument('sweep', '1:100Hz log')}"
+                    f"{argument('sweep', '1:100Hz log')}, or give {argument('frequency', 5)}"
                 )
             if not rows:
                 self.required("frequency")
@@ -274,6 +275,7 @@ class _TableBinding(Binding):
         channels = self.source.channels
         roles = ("time", *MOTION_KINDS, "force")
         called = [r for r in roles if any(c.is_called(RECORD_COLUMNS[r]) for c in channels)]
+        called = [r for r in roles if r in self.map.roles] or called
         if called[:1] == ["time"] and len(called) > 1:
             raise WaveformsError(
                 f"{self.source.name}: it holds waveforms ({listed([c.header for c in channels], 5)}"

@@ -27,8 +27,10 @@ _BY_UNIT = ("frequency", "amplitude", "drive", "gain", "phase")
 _BY_NAME = ("response", "real", "imag", "gain_db", "level")
 _RESPONSE = {role: RESPONSE_COLUMNS[role] for role in _BY_UNIT}
 _RESPONSE |= {role: replace(RESPONSE_COLUMNS[role], kinds=()) for role in _BY_NAME}
-_FREQUENCY = RESPONSE_COLUMNS["frequency"]
-_F_TOO = replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))
+_SHORT = {
+    role: replace(RESPONSE_COLUMNS[role], names=(*RESPONSE_COLUMNS[role].names, *names))
+    for role, names in (("frequency", ("f",)), ("amplitude", ("a", "amp")))
+}  # names that have another meaning in a record
 
 
 @dataclass(frozen=True)
@@ -141,8 +143,8 @@ def _proposal(source: RawFile) -> str:
     if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
         groups = {path: channel for path, channel in groups.items() if channel.size > 1}
     response = _is_response(groups.values())
-    every = RESPONSE_COLUMNS | {"frequency": _F_TOO} if response else RECORD_COLUMNS
-    proposed = _RESPONSE | {"frequency": _F_TOO} if response else _RECORD
+    every = RESPONSE_COLUMNS | _SHORT if response else RECORD_COLUMNS
+    proposed = _RESPONSE | _SHORT if response else _RECORD
     roles: dict[str, str] = {}
     for role, column in proposed.items():
         free = {p: c for p, c in groups.items() if p not in roles.values()}
@@ -202,7 +204,9 @@ def _is_response(channels: Collection[RawChannel]) -> bool:
         return any(c.is_called(column) or column.accepts(c.unit, c.name) for c in channels)
 
     sampled = any(any_is(_RECORD[role]) for role in ("time", *MOTION_KINDS))
-    return any_is(_FREQUENCY) or (not sampled and any_is(_F_TOO))
+    if any_is(RESPONSE_COLUMNS["frequency"]) or "phase" in [plain(c.name) for c in channels]:
+        return True
+    return not sampled and any_is(_SHORT["frequency"])
 
 
 def _entry(role: str, path: str, channel: RawChannel) -> Iterator[str]:
