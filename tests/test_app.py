@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import os
 import subprocess
 import sys
@@ -123,6 +124,15 @@ def test_a_bad_file_is_refused_in_the_reader_s_words(server):
     alert = page.partition('role="alert"')[2].partition("</div>")[0]
     assert "a file.csv: the file is empty" in alert
     assert 'value="model" disabled' in page
+
+
+def test_channels_are_read_as_the_page_proposes(server):
+    rows = "\n".join(f"{0.01 * i},{math.sin(0.1 * i)},{math.cos(0.1 * i)}" for i in range(400))
+    waves = f"time [s],LVDT [um],load cell [N]\n{rows}"
+    table = "Frequenz [Hz],Weg [um],Steifigkeit [N/m],Phase [deg]\n1,1,30,3\n1,9,20,30\n1,90,3,70"
+    for text, found in ((waves, "waveforms"), (table, "a table of responses")):
+        page = server.page(server.upload([("own.csv", text.encode())]))
+        assert f"Read as {found}" in page
 
 
 def test_two_channels_with_one_role_are_named(server):

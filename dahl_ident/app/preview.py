@@ -48,16 +48,16 @@ def preview(state: dict[str, Any]) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _add_channels(files[0], result)
-            _add_data(files, state["reading"], result)
+            columns = _add_channels(files[0], result)
+            _add_data(files, columns, state["reading"], result)
         except (DahlIdentError, ValueError, OSError) as exc:
             result["error"] = str(exc)
     result["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
     return result
 
 
-def _add_channels(file: str, result: dict[str, Any]) -> None:
-    """Add format, sampling and notes of a file, and its channels with their roles."""
+def _add_channels(file: str, result: dict[str, Any]) -> dict[str, Any]:
+    """Add the channels of a file, and return its column map, which is proposed at first."""
     source = open_source(file)
     summary = contents(source)
     path = Path("columns.toml")
@@ -80,13 +80,15 @@ def _add_channels(file: str, result: dict[str, Any]) -> None:
                 "unit": entry.get("unit") or channel.unit or "",
             }
         )
+    return roles
 
 
-def _add_data(files: Sequence[str], reading: dict[str, str], result: dict[str, Any]) -> None:
+def _add_data(
+    files: Sequence[str], columns: dict[str, Any], reading: dict[str, str], result: dict[str, Any]
+) -> None:
     """Read the files as the commands do, and add a summary and pictures."""
     common: dict[str, Any] = {n: reading[n] for n in COMMON_OPTIONS if reading.get(n)}
-    if Path("columns.toml").exists():
-        common["columns"] = "columns.toml"
+    common["columns"] = columns
     kind = reading.get("kind", "")
     if kind in ("", "table"):
         options: dict[str, Any] = {n: reading[n] for n in TABLE_OPTIONS if reading.get(n)}
