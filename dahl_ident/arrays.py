@@ -66,7 +66,8 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
             "pass an amplitude or a waveform, not a phasor"
         )
     if array.dtype.kind not in "fiu":
-        raise ValidationError(f"{name}: expected real numbers, got dtype {array.dtype}")
+        got = f"dtype {array.dtype}" if array.ndim else repr(value)
+        raise ValidationError(f"{name}: expected real numbers, got {got}")
     return array.astype(np.float64, copy=False)
 
 

@@ -64,8 +64,8 @@ def definition(folder, **changes):
         "output": {"folder": str(folder / "results")},
     }
     for name, value in changes.items():
-        table, key = name.split("__")
-        content.setdefault(table, {})[key] = value
+        table, _, key = name.partition("__")
+        content[table] = {**content.get(table, {}), key: value} if key else value
     return content
 
 
@@ -173,6 +173,8 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "folder": ({"output__folder": 3}, "expected the path of a folder"),
     "reports": ({"output__reports": "no"}, "expected true or false"),
     "date": ({"fit__noise": date(2026, 1, 1)}, "a date or a time"),
+    "law": ({"model": [{"kind": "dal"}]}, "^the campaign: .*did you mean 'dahl'"),
+    "value": ({"model": [{"kind": "dahl", "f_max": "abc"}]}, "f_max: expected real .* got 'abc'"),
 }
 
 
@@ -249,6 +251,16 @@ def test_options_that_no_fit_can_use_leave_no_result(tmp_path, changes, message)
     with pytest.raises(DataError, match=message):
         di.campaign(definition(tmp_path, **changes), jobs=1)
     assert di.campaign(definition(tmp_path), jobs=1).statuses == {"trusted": 2}
+
+
+def test_a_table_that_is_not_of_a_campaign_is_kept(tmp_path):
+    make_tables(tmp_path, 1)
+    path = tmp_path / "results" / "results.csv"
+    path.parent.mkdir()
+    path.write_text("mine")
+    with pytest.raises(DataError, match=r"results\.csv exists, and is not of a campaign"):
+        di.campaign(definition(tmp_path), jobs=1)
+    assert path.read_text() == "mine"
 
 
 def test_one_device_that_the_options_do_not_fit_is_a_row(tmp_path):
@@ -692,6 +704,12 @@ def test_command_line(tmp_path, run):
     done = run("campaign", str(path), "--jobs", "1", "--report", str(report), "--json")
     assert json.loads(done.out)["to_do"] == ["d000", "d001", "d002", "d003"]
     assert b"Population: f_max" in report.read_bytes()
+    as_waves = path.read_text().replace("response", "record") + '[output]\nfolder = "waves"\n'
+    path.write_text(as_waves)
+    waves = run("campaign", str(path))
+    assert waves.status == 3
+    assert "the table says why, such as DataError: " in waves.err
+    assert "d000_r0.csv: no motion found" in waves.err
     assert run("campaign", str(path), "--report", "campaign.pdf").status == 0
     assert Path("campaign.pdf").read_bytes().startswith(b"%PDF")
 

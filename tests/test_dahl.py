@@ -196,8 +196,8 @@ def test_bad_amplitudes_are_named(amplitude, text):
         (np.inf, r" is inf; expected finite"),
         (1j, r": expected real numbers, got complex"),
         ([1.0, 2.0], r": expected one number, got an array of shape \(2,\)"),
-        ("0.1", r": expected real numbers, got dtype"),
-        (True, r": expected real numbers, got dtype bool"),
+        ("0.1", r": expected real numbers, got '0.1'"),
+        (True, r": expected real numbers, got True"),
         (1e-200, r" is 1e-200; expected numbers of at least 1e-90; check the unit"),
     ],
 )

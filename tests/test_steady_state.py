@@ -298,7 +298,7 @@ def test_shapes_broadcast_and_scalars_stay_scalars():
         (1.0, np.inf, r"drive is inf; expected finite"),
         (1.0, 1.0 + 1.0j, r"drive: expected real numbers, got complex"),
         (1.0, 1e300, r"drive is 1e\+300; expected numbers of at most 1e\+90"),
-        (1.0, True, r"drive: expected real numbers, got dtype bool"),
+        (1.0, True, r"drive: expected real numbers, got True"),
         ([1.0, 2.0], [0.1, 0.2, 0.3], r"frequency_hz \(2,\), drive \(3,\)"),
     ],
 )

@@ -41,7 +41,7 @@ from typing import Any
 
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.storage import read_toml, regular
-from dahl_ident.errors import DataError, ValidationError, choices
+from dahl_ident.errors import DataError, ModelError, ValidationError, choices
 
 _TABLES = {"laws", "files", "read", "extract", "fit", "posterior", "model", "output"}
 _FILES = {"pattern", "kind", "covariates"}
@@ -119,7 +119,7 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         name, folder = str(path), path.resolve().parent
     try:
         return _checked(name, folder, content)
-    except ValidationError as exc:
+    except (ModelError, ValidationError) as exc:
         raise DataError(f"{name}: {exc}") from exc
 
 

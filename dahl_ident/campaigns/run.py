@@ -255,6 +255,11 @@ def campaign(
         agree = _options_agree(definition, redo)
         return _before(definition, tasks, read_journal(folder / _JOURNAL)[0] if agree else ())
     make_folder(folder)
+    if (table := folder / "results.csv").exists() and not (folder / _JOURNAL).exists():
+        raise DataError(
+            f"{definition.source}: {table} exists, and is not of a campaign; move it away, or give "
+            "another folder in [output]"
+        )
     lost: LostError | None = None
     with locked(folder / _JOURNAL, DataError):
         agree = _options_agree(definition, redo)

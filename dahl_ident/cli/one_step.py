@@ -325,8 +325,13 @@ def campaign(
         console.write("\n".join([*(f"to do: {name}" for name in result.to_do), str(result)]))
     else:
         console.write(f"{result}\ntable: {result.folder / 'results.csv'}")
-    usable = any(status in USABLE for status in result.statuses)
-    console.finish(running.dry_run or usable, "no fit can be used; the table says why")
+    usable, why = any(status in USABLE for status in result.statuses), ""
+    if not (running.dry_run or usable):
+        column = "error" if "error" in result.table else "statements"
+        why = result.table[column].dropna().iloc[0]
+    console.finish(
+        running.dry_run or usable, f"no fit can be used; the table says why, such as {why}"
+    )
 
 
 def _line_printer() -> Callable[[int, int], None]:
