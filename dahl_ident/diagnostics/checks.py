@@ -8,6 +8,7 @@ of records both have, or is marked as one for tables or records only.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial, wraps
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import warnings_in
 from dahl_ident.diagnostics.assessment import TableAssessment
-from dahl_ident.diagnostics.contributions import NOISE
+from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.judgement import (
@@ -37,6 +38,7 @@ from dahl_ident.diagnostics.physics import (
 )
 from dahl_ident.diagnostics.record_assessment import RecordAssessment
 from dahl_ident.diagnostics.record_errors import REMEDY
+from dahl_ident.errors import FitError
 from dahl_ident.extraction.segment_quality import clipped_share, sensor_step
 from dahl_ident.fitting.losses import LOSSES
 from dahl_ident.units import si_unit
@@ -47,6 +49,7 @@ _OF_WRONG_LAW = 0.05  # the same where another law has a far smaller misfit
 _SLOW_SAMPLES = 0.3  # effective share of the samples, below which noise looks like a wrong law,
 _VISIBLE = 0.05  # if its rms is more than this share of the output
 _FEW = 10.0  # degrees of freedom: an uncertainty is then known to 20 %
+_FEW_RUNS, _WIDE = 3.0, 4.0  # degrees of freedom of few runs; k twice that of many
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _ENOUGH_HELD_OUT = 16  # held-out values: with 16, fewer than 80 % in 95 % bands is a 1 % chance
 _DOUBTS_SHOWN = 5  # warnings shown; more would hide the verdict
@@ -397,6 +400,19 @@ def reading(fit: Any) -> Iterator[Finding]:
         yield described("more_warnings", count=len(texts) - _DOUBTS_SHOWN)
 
 
+def _few_runs(fit: Assessed) -> Iterator[Finding]:
+    """Yield that intervals are wide because few runs show the scatter between them."""
+    if not fit.counts_sources:
+        return
+    with suppress(FitError):  # nothing is determined
+        budgets = fit.budget().values()
+        dof = min((r.dof for b in budgets for r in b.rows if r.source == RUNS), default=np.inf)
+        k = max(b.k for b in budgets)
+        if dof < _FEW_RUNS and k > _WIDE:
+            values = {"k": k, "runs": 1 + round(dof)}
+            yield Finding(Question.ASSUMED, _TRUSTED, "few_runs", values)
+
+
 def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
     """Yield one finding with the assumptions that the data of a fit cannot test.
 
@@ -446,5 +462,6 @@ CHECKS: tuple[_Check, ...] = (
     _size_of_residuals,
     reading,
     _treatment_of_noise,
+    _few_runs,
     assumptions,
 )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from string import Formatter
 from typing import Any
 
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, coverage_factor, level_text
 from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.errors import argument, spelled
 from dahl_ident.units import counted, percent
@@ -325,5 +325,9 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "evidence": "ln evidence: {ln:.4f}",
     "warning": "Warning on reading: {text}.",
     "more_warnings": lambda count: f"{counted(count, 'more warning')} on reading.",
+    "few_runs": lambda k, runs: (
+        f"The scatter of {runs} runs has {counted(runs - 1, 'degree of freedom')}, so the coverage "
+        f"factor k is up to {k:.3g}; with another run, about {coverage_factor(runs):.2g}."
+    ),
     "assumed": _assumed,
 }
