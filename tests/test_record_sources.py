@@ -325,6 +325,18 @@ def test_a_delay_that_nobody_stated_is_estimated(delay):
     assert again.params["sigma"].stderr == pytest.approx(fit.params["sigma"].stderr, rel=1e-6)
 
 
+@pytest.mark.parametrize("size", [1e-3, 5e-3])
+def test_a_delay_too_long_to_be_removed_is_counted(size):
+    """Ten samples move sigma by 15 %."""
+    rng, t = np.random.default_rng(10), np.arange(2000) / 500.0
+    x = 6e-3 * np.sin(6.0 * t)
+    force = DAHL.force(x) + size * rng.standard_normal(t.size)
+    late = di.Record(t[10:], displacement=x[10:], force=force[:-10])
+    fit = di.fit(late, di.Dahl())
+    assert_near(fit, (("f_max", 0.1), ("sigma", 30.0), ("alpha", 1.0)), 2.0)
+    assert "delay between the channels" in sources(fit, "sigma")
+
+
 def test_outliers_that_a_loss_sets_aside_are_no_error_of_the_displacement():
     """The motion is exact, so that what it adds is as small as without outliers."""
     rng, t = np.random.default_rng(1), np.arange(2000) / 200.0

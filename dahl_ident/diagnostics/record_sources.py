@@ -231,7 +231,7 @@ def by_delay(fit: LinearFit) -> FloatArray:
     """Return the covariance of the estimate due to the delay, which the user did not state.
 
     Its prior has the standard deviation of one sample, with less weight if the records have more
-    information; the estimated delay is removed already.
+    information; the estimated delay is removed already, unless it is too long for that.
     """
     sample = 1.0 / fit.problem.records[0].sample_rate
     freed = _FreedValue.of(fit, [sample * slope for slope in fit.delay_slopes])
@@ -258,14 +258,16 @@ class _FreedValue(NamedTuple):
     def with_prior(self, mean: float, s: float, exact: FloatArray) -> tuple[float, FloatArray]:
         """Return the standard deviation of the value, and what it adds to the others' covariance.
 
-        `mean` is the estimate by the records, `s` the standard deviation of the prior, `exact` the
-        covariance of the others where this value is exact.
+        `mean` is the estimate by the records, `s` the standard deviation of the prior, which is
+        widened where the records contradict it; `exact` is the covariance of the others where this
+        value is exact.
         """
         u2, C = float(self.covariance[-1, -1]), self.covariance
         line = np.outer(self.others, self.others)
         if not np.isfinite(u2):
             return s, s**2 * line
-        s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
+        contradiction = max(mean**2 - _CONTRADICTED**2 * u2, 0.0) ** 0.5
+        s = max(s, s**2 / max(u2, 1e-300) ** 0.5, contradiction)
         weight = s**2 / (s**2 + u2)
         shrink = np.column_stack([np.eye(self.others.size), (weight - 1.0) * self.others])
         total = shrink @ np.where(np.isfinite(C), C, 0.0) @ shrink.T
