@@ -220,6 +220,13 @@ def test_what_one_kind_alone_has_is_refused_in_one_way(fit):
         fit.backbone(1e-3)
 
 
+def test_the_model_of_a_fit_is_fitted_again(fit):
+    again = di.fit(record(TRUE + NOISE), fit.model)
+    for name in ("f_max", "sigma"):
+        assert again.params[name].value == pytest.approx(fit.params[name].value, rel=1e-6)
+        assert again.params[name].vary
+
+
 def test_a_fit_of_records_predicts_responses_to_sines(fit):
     A = np.array([1e-3, 4e-3])
     band, truth = fit.describing_function(A), di.Dahl(0.1, 30.0).describing_function(A)

@@ -181,9 +181,9 @@ class RecordAssessment(Assessment):
 
     @cached_property
     def model(self) -> Model:
-        """The model with every parameter fixed at its estimate."""
+        """The model with the estimates put in; parameters stay free or fixed as they were."""
         values = dict(zip(self.optimum.names, self.optimum.values.tolist(), strict=True))
-        return self.problem.model.with_fixed(
+        return self.problem.model.with_values(
             {p.name: p.nearest(values[p.name]) for p in self.problem.free}
         )
 

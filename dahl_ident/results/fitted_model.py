@@ -302,8 +302,8 @@ class FittedModel(Result):
         limits = self.conf_interval().at(LEVELS[1])
         rows = {}
         for name, p in self.params.items():
-            known = {"lower": limits[name].lower, "upper": limits[name].upper} if p.vary else {}
-            rows[name] = {**asdict(p), **known}
+            ends = limits[name]._asdict() if name in limits else {}
+            rows[name] = {**asdict(p), **ends}
         frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
         columns = ["value", "stderr", "lower", "upper", "unit", "vary", "description"]
         return frame.reindex(columns=[*columns, "init_value", "min", "max"])
