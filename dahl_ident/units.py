@@ -223,7 +223,8 @@ def prefix(values: Iterable[float], unit: str) -> tuple[float, str]:
     sizes = sorted(abs(v) for v in values if v != 0.0 and math.isfinite(v))
     if not sizes or unit not in ("N", "m", "s", "Hz", "J", "rad"):
         return 1.0, unit
-    exponent = 3 * math.floor(math.log10(sizes[len(sizes) // 2]) / 3.0)
+    shown = float(f"{sizes[len(sizes) // 2]:.3g}")  # 999.7 nm is 1 um
+    exponent = 3 * math.floor(math.log10(shown) / 3.0)
     if exponent not in _PREFIXES:
         return 1.0, unit
     return 10.0**exponent, f"{_PREFIXES[exponent]}{unit}"

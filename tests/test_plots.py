@@ -190,6 +190,12 @@ def test_budget():
     return the_figure(plots.plot_budget(rows))
 
 
+def test_long_names_of_sources_are_not_cut_off():
+    sources = "scatter between runs", "force calibration", "noise", "exponent"
+    rows = [("force_gain", source, 0.2) for source in (*sources, "scatter between repeated levels")]
+    the_figure(plots.plot_budget(rows))
+
+
 @same_picture
 def test_margins():
     gain = np.where(A > 1e-2, np.inf, 1.0 / A)
@@ -429,6 +435,7 @@ def test_repeated_measurements_of_a_level_are_not_joined():
     [
         (3.33e-3, "m", "3.33 mm"), (2e-7, "m", "200 nm"), (0.0, "N", "0 N"),
         (5.0, "N/m", "5 N/m"), (2.5e3, "N", "2.5 kN"), (float("inf"), "N", "inf N"),
+        (9.997e-7, "m", "1 \u00b5m"),
     ],
 )  # fmt: skip
 def test_engineering_notation(value, unit, text):

@@ -8,11 +8,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.reporting.document import Cell, Document, Section, TextTable
+from dahl_ident.reporting.document import Cell, Document, Paragraph, Section, TextTable
 from dahl_ident.reporting.pdf import pdf
 from tests.browser import CHROMIUM, chromium
 
@@ -164,6 +165,17 @@ def test_headings_and_captions_in_pdf_stay_with_what_they_head():
         assert f"row {i}.0." in page
 
 
+@pytest.mark.parametrize("count", [36, 39])
+def test_fields_for_the_signature_are_not_alone_on_a_page(count):
+    pypdf = pytest.importorskip("pypdf")
+    facts = Section("facts", tuple(Paragraph(f"fact {i}.") for i in range(count)))
+    sections = (facts, Section("details", (Paragraph("more"),), details=True))
+    whole = Document(title="t", status="trusted", verdict=("v",), sections=sections)
+    pages = [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(pdf(whole))).pages]
+    (signed,) = (text for text in pages if "Signature" in text)
+    assert f"fact {count - 1}." in signed
+
+
 def test_the_verdict_is_told_once(fit, tmp_path):
     text = report(fit, tmp_path / "once.md").read_text(encoding="utf-8")
     told = [line for line in text.splitlines() if not line.startswith("![")]  # alt texts tell more
@@ -305,6 +317,10 @@ def test_measured_loops_and_settling_are_shown(tmp_path):
     assert "Quality of each point" in text
     assert "Points measured from waveforms: 1, all good." in text
     assert "Settling of the point at 1.25 Hz, 0.008 m" in text
+    gain = di.Sensors(force_gain=stats.norm(1.0, 0.01))
+    calibrated = di.fit(fit.data, fit.model, sensors=gain, throw=False)
+    text = report(calibrated, tmp_path / "r.md").read_text(encoding="utf-8")
+    assert "There is no measured loop, because a calibration is not exact." in text
     other = di.Record(t, displacement=x, force=x, provenance={"sha256": "00"})
     with pytest.raises(ValidationError, match="not extracted from this record"):
         report(fit, tmp_path / "other.html", record=other)

@@ -265,7 +265,7 @@ def plot_budget(
     """
     parameters = list(dict.fromkeys(parameter for parameter, _, _ in rows))
     sources = list(dict.fromkeys(source for _, source, _ in rows))
-    legend_rows = -(-len(sources) // 3)
+    legend_rows = -(-len(sources) // 2)
     size = (5.6, 1.0 + 0.45 * len(parameters) + 0.2 * legend_rows)
     axis = style.axes(ax, size=size)
     ends = np.zeros(len(parameters))
@@ -301,7 +301,7 @@ def plot_budget(
     axis.set(xlabel=x_label, xlim=(0.0, 100.0), ylim=(len(parameters) - 0.4, -0.6))
     axis.set_yticks(range(len(parameters)), parameters)
     axis.grid(visible=False, axis="y")
-    axis.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
+    axis.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
     return axis
 
 

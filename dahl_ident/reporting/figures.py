@@ -334,7 +334,13 @@ def _loops(fit: FitResult, friction: Friction) -> Picture:
     caption = "Lines: friction of the fitted element at three amplitudes of the data. "
     finding = f"A cycle loses {lost[0]} and {lost[-1]} (standard uncertainties)."
     if not measured:
-        caption += "The data hold no higher harmonics of the force, so there is no measured loop."
+        alone = bool((fit.data.harmonic == 1).all())
+        why = (
+            "the data hold no higher harmonics of the force"
+            if alone
+            else "a calibration is not exact"
+        )
+        caption += f"There is no measured loop, because {why}."
         return Picture("loops", caption, finding, draw)
     caption += "Dots: the sum of the measured harmonics, less the force of the other elements."
     deviations = [

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; of a heading, and of the text kept below it
 _LONGEST = 60  # most letters of a title at the foot of a page
 _WHOLE = 20.0  # mm; paragraphs up to this height are not divided between pages
+_MARGIN = 16.0  # mm, of the pages
 _SIGNATURE = 26.0  # mm, height of the fields for date and signature
 _WIDEST_COLUMN = 75.0  # mm, largest width of a column of a table
 _PADDING = 3.5  # mm, on both sides of a column's text
@@ -65,7 +67,9 @@ def pdf(document: Document) -> bytes:
         _text(page, line)
     _header(page, document)
     before: Section | None = None
-    for section in document.sections:
+    for section, after in zip_longest(document.sections, document.sections[1:]):
+        signed = not section.details and after is not None and after.details
+        page.set_auto_page_break(True, _MARGIN + _SIGNATURE * signed)  # not alone on a page
         if section.details and not (before and before.details):
             _signature(page, document.signatory)
             page.add_page()
@@ -110,8 +114,8 @@ def _page(document: Document) -> FPDF:
 
     page = Page(format="A4")
     page.struct_builder = _Structure()
-    page.set_margins(16, 16, 16)
-    page.set_auto_page_break(True, 16)
+    page.set_margins(_MARGIN, _MARGIN, _MARGIN)
+    page.set_auto_page_break(True, _MARGIN)
     page.set_title(document.title)
     page.set_lang("en")
     for face, file in _FACES.items():
