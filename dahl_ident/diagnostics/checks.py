@@ -7,7 +7,7 @@ of records both have, or is marked as one for tables or records only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import partial, wraps
 from typing import Any
@@ -19,6 +19,7 @@ from dahl_ident.data.tabular import warnings_in
 from dahl_ident.diagnostics.assessment import TableAssessment
 from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.estimate import scores_of
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.judgement import (
     Finding,
@@ -41,6 +42,8 @@ from dahl_ident.diagnostics.record_errors import REMEDY
 from dahl_ident.errors import FitError
 from dahl_ident.extraction.segment_quality import clipped_share, sensor_step
 from dahl_ident.fitting.losses import LOSSES
+from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.noise import squares_of
 from dahl_ident.units import si_unit
 
 _TOO_LARGE = 0.5  # rms misfit: the model does not describe half of the response
@@ -285,55 +288,37 @@ def _exponents(fit: Assessed) -> Iterator[Finding]:
 
 @_of_tables
 def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield which parameters a robust fit moves by more than one uncertainty."""
-    optimum, errors = fit.optimum, fit.errors
-    if optimum.loss != "linear" or errors is None:
+    """Yield which parameters a robust fit moves by more than one uncertainty from noise."""
+    if fit.optimum.loss != "linear" or fit.errors is None:
         return
-    robust, by_noise = robust_values(errors, optimum.scale)
-    moved = tuple(
-        name for name in optimum.names if abs(robust[name] - errors.values[name]) > by_noise[name]
-    )
+    at = fit.by_noise
+    moves = zip(robust_values(at), at.values, at.stderr.items(), strict=True)
+    moved = tuple(name for robust, value, (name, u) in moves if abs(robust - value) > u)
     if moved:
         rows = tuple(point.name for point in fit.goodness.suspicious)
         yield described("moved", _APPROXIMATE, names=moved, rows=rows)
 
 
-def robust_values(
-    errors: ErrorModel, scale: float
-) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    """Return the values of a robust fit, and the noise's standard errors of the estimate, by name.
+def robust_values(at: Optimum) -> FloatArray:
+    """Return the values (P,) of a robust fit to the model linearised at an estimate.
 
-    The fit is one of iterated weights to the model linearised at the estimate. Assumed exponents
-    are fixed. The noise's scale, where it is not stated, is the robust one of
-    :mod:`dahl_ident.fitting.losses`, with `scale` as its start.
+    The noise's scale, where it is not stated, is the robust one of
+    :mod:`dahl_ident.fitting.losses`.
     """
-    problem, loss = errors.estimate.problem, LOSSES["huber"]
-    y, J = problem.residuals_and_jacobian(errors.theta)
-    free = [i for i, name in enumerate(problem.names) if name not in errors.assumed]
-    J, rows = J[:, free], problem.n_residuals // 2
-    variance = 1.0 if problem.scale_known else scale**2
-    weight = np.ones(len(y))
-    weight[2 * rows :] = variance  # priors have a known variance
-    covariance = np.linalg.pinv(J.T @ (weight[:, None] * J) / variance)
-    move: FloatArray = np.zeros(len(free))
+    problem, loss, scale = at.problem, LOSSES["huber"], at.scale
+    (y, J), m = problem.residuals_and_jacobian(at.theta), problem.n_residuals
+    move: FloatArray = np.zeros(len(at.theta))
     for _ in range(_PASSES):
-        square = np.sum((y + J @ move)[: 2 * rows].reshape(rows, 2) ** 2, axis=1)
         if not problem.scale_known:
-            variance *= loss.rescaled(square / variance, 2 * rows - len(free))
-        weight[: 2 * rows] = np.repeat(loss.slope(square / variance), 2)
-        weight[2 * rows :] = variance
-        root = np.sqrt(weight)
-        last = move
-        move = np.asarray(np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)[0])
-        if np.linalg.norm(J @ (move - last)) < _SETTLED * np.sqrt(variance):
+            square = squares_of((y + J @ move)[:m] / scale)
+            scale *= loss.rescaled(square, m - len(move)) ** 0.5
+        unit = np.append(np.full(m, scale), np.ones(len(y) - m))  # priors have a known variance
+        scores, columns = scores_of((y + J @ move) / unit, m, loss), J / unit[:, None]
+        step = np.linalg.lstsq(columns, -scores, rcond=1e-10)[0]
+        move = move + step
+        if np.linalg.norm(columns @ step) < _SETTLED:
             break
-    theta, std = errors.theta.copy(), np.zeros(len(errors.theta))
-    theta[free] += move
-    std[free] = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    std *= np.abs(problem.value_slopes(errors.theta))
-    robust = dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
-    by_noise = dict(zip(problem.names, std.tolist(), strict=True))
-    return robust, by_noise
+    return np.asarray(problem.to_values(at.theta + move))
 
 
 @_of_records
