@@ -32,7 +32,7 @@ from dahl_ident.diagnostics.physics import (
     OF_FRICTION,
     friction_quantities,
     is_spring,
-    negative_parameters,
+    negative_elements,
 )
 from dahl_ident.diagnostics.record_channels import RELATIVE_STEP
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
@@ -273,8 +273,9 @@ class ModelComparison:
             f"{gain:.0f} ± {error:.0f}. It leaves {percent(best.density.misfit)} of {output}, "
             f"and {_noise(best.optimum.problem)}."
         )
-        negative = [f"There {warning}." for warning in negative_parameters(best.optimum)]
-        return " ".join([text, *negative])
+        estimates = dict(zip(best.optimum.names, best.optimum.values.tolist(), strict=True))
+        negative = negative_elements(best.optimum.problem, (estimates, best.optimum.stderr))
+        return " ".join([text, *(f"There {finding}" for finding in negative)])
 
     def __str__(self) -> str:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]

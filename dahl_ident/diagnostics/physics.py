@@ -138,7 +138,10 @@ def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
 
 def physical_warnings(optimum: Optimum) -> Iterator[str]:
     """Yield a sentence for each property of an estimate that is impossible or unsafe."""
-    yield from negative_parameters(optimum, estimated=False)  # findings name the estimated ones
+    for p in (e.parameters[0] for e in optimum.problem.model.elements if is_single(e)):
+        if not p.free and p.value is not None and p.value < 0.0:  # findings name estimated ones
+            unit = shown_unit(p.unit, optimum.problem.motion)
+            yield f"{p.name} is negative, as given: {p.value:g} {unit}"
     if optimum.status is Status.AT_BOUND:
         at_bounds = values_at_bounds(optimum.problem, optimum.theta, optimum.values)
         yield at_bounds or optimum.message  # that of constraints states them
@@ -159,23 +162,6 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
             "the describing function, which takes the motion for a sine, is "
             f"{percent(error)} off at {name}: fit with {argument('steady', 'exact')}"
         )
-
-
-def negative_parameters(optimum: Optimum, *, estimated: bool = True) -> Iterator[str]:
-    """Yield every mass, damping or stiffness below zero, with its value.
-
-    With `estimated` false, only those that were given.
-    """
-    problem, values = optimum.problem, parameter_values(optimum)
-    values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-    for parameter in (e.parameters[0] for e in problem.model.elements if is_single(e)):
-        value, error = values[parameter.name], optimum.stderr.get(parameter.name, 0.0)
-        if value < 0.0 and np.isfinite(value) and (estimated or not parameter.free):
-            unit = shown_unit(parameter.unit, problem.motion)
-            within = " (zero is within two standard errors)" if -value < 2.0 * error else ""
-            known = parameter.name not in optimum.names
-            size = f"as given: {value:g} {unit}" if known else with_unit(value, error or None, unit)
-            yield f"{parameter.name} is negative, {size}{within}"
 
 
 def beyond_friction_limit(
