@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.misfit_explanations import rms_misfit
+from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.fitting import solve
 from dahl_ident.problem import TableProblem
@@ -119,7 +119,9 @@ def beam() -> None:
         cells = [f"{100.0 * least:.1f} %"]
         for law in (di.Iwan(), di.Dahl()):
             found = solve(TableProblem(data, law + di.Mass() + di.Damper()))
-            cells.append(f"{100.0 * rms_misfit(found.problem, found.theta):.1f} %")
+            cells.append(
+                f"{100.0 * rms_misfit_of(found.problem, found.problem.predict(found.theta)):.1f} %"
+            )
         print(f"| {kind.lower()} | {data.n} | {' | '.join(cells)} |", flush=True)
 
 

@@ -113,19 +113,6 @@ def _diagonal(covariance: FloatArray) -> FloatArray:
     return np.diagonal(covariance, axis1=1, axis2=2)
 
 
-def stated_noise(
-    problem: TableProblem, theta: FloatArray, amplitude: FloatArray, omega: FloatArray
-) -> FloatArray:
-    """Return the covariance of ln gain and phase of residuals of unit variance, (n, 2, 2).
-
-    At each point it is that of the nearest measured row.
-    """
-    problem = problem.widened(np.zeros(problem.data.n))
-    units = relative_units(problem, theta, problem.predict(theta))
-    units = units[_nearest(problem, amplitude, omega)]
-    return np.asarray(units @ units.swapaxes(1, 2))
-
-
 def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) -> IntArray:
     """Return the fundamental's row nearest to each point, in ln A and ln omega."""
     view = problem.stiffness_data
@@ -271,9 +258,11 @@ def response_band(
     view = new.like(data=predicted, noise="absolute").stiffness_data  # as if measured
     if errors is None:
         noise = np.zeros((R.size, 2, 2))
-        if of_a_test:
-            stated = stated_noise(problem, theta, view.amplitude, view.omega)
-            noise[known] = optimum.scale**2 * stated
+        if of_a_test:  # with the noise of the nearest measured row
+            stated = problem.widened(np.zeros(problem.data.n))
+            units = optimum.scale * relative_units(stated, theta, stated.predict(theta))
+            units = units[_nearest(stated, view.amplitude, view.omega)]
+            noise[known] = units @ units.swapaxes(1, 2)
         return _noise_band(optimum, R, by, noise)
     return _combined_band(
         errors, R, by, known, view.amplitude, view.omega, view.stiffness, of_a_test

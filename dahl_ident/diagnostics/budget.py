@@ -135,13 +135,6 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     return Candidate(name, shown_unit("N/m", motion), value, direction, members)
 
 
-def runaway(optimum: Optimum) -> frozenset[str]:
-    """Return the names of parameters whose optimum is infinite, or zero for positive ones."""
-    positive, values = optimum.problem.space.positive, optimum.values
-    gone = ~np.isfinite(values) | (positive & (values == 0.0))
-    return frozenset(np.array(optimum.names)[gone].tolist())
-
-
 def _unit(powers: Mapping[Parameter, float]) -> str:
     """Return the unit of a product, such as "N/m^2"."""
     above, below = list[str](), list[str]()
@@ -356,7 +349,9 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
     slopes = problem.value_slopes(errors.theta)
     units = {p.name: p.unit for p in problem.parameters}
     positive = {p.name: p.positive for p in problem.parameters}
-    lost = runaway(optimum)
+    space, values = optimum.problem.space, optimum.values
+    gone = ~np.isfinite(values) | (space.positive & (values == 0.0))
+    lost = {name for name, is_gone in zip(optimum.names, gone, strict=True) if is_gone}
     for name, direction, slope in zip(names, np.eye(len(names)), slopes, strict=True):
         if name in errors.assumed or name in lost:
             continue

@@ -26,8 +26,9 @@ from dahl_ident.diagnostics.judgement import (
     Judgement,
     Question,
     VerdictStatus,
+    assumed,
     described,
-    undetermined,
+    determined,
 )
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.physics import (
@@ -114,12 +115,12 @@ def _parameters(fit: Assessed) -> Iterator[Finding]:
     if noise_known or known.complete:
         yield known.finding
     if noise_known and not known.complete and known.combinations:
-        yield undetermined("combinations", combinations=tuple(map(str, known.combinations)))
+        yield determined("combinations", combinations=tuple(map(str, known.combinations)))
     if not fit.success:
         message = optimum.status.value if optimum.status.at_infinity else optimum.message
-        yield undetermined("solver", message=message)
+        yield determined("solver", message=message)
     if optimum.dof <= 0:
-        yield undetermined(
+        yield determined(
             "no_degrees_of_freedom",
             numbers=optimum.problem.n_residuals,
             parameters=len(optimum.names),
@@ -128,7 +129,7 @@ def _parameters(fit: Assessed) -> Iterator[Finding]:
     if noise_known:
         for why in dict.fromkeys(parameter.why for parameter in known.open):
             shown = {p.name: p.known_text for p in known.open if p.why == why}
-            yield undetermined("undetermined_parameters", shown=shown, why=why)
+            yield determined("undetermined_parameters", shown=shown, why=why)
 
 
 # Described?
@@ -403,19 +404,19 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
 
     Those of noise alone, unless all sources of error are `counted`.
     """
-    counted, (values, stderr) = counted and fit.counts_sources, fit.known
+    counted, (estimates, stderr) = counted and fit.counts_sources, fit.known
     ranges, stated = [], dict[str, float]()
     for p in fit.problem.model.parameters:
         if p.prior is None or p.free:
             continue
         if counted and p.name in fit.assumed:
             low, high = p.prior
-            known = {"value": values[p.name], "stderr": stderr[p.name], "unit": p.unit}
+            known = {"value": estimates[p.name], "stderr": stderr[p.name], "unit": p.unit}
             ranges.append({"name": p.name, "low": low, "high": high, **known})
         elif p.value is not None:
             stated[p.name] = p.value
     cost = fit.constraint_cost
-    assumed = {
+    values = {
         "ranges": tuple(ranges),
         "stated": stated,
         "constraints": () if cost is None else tuple(cost.texts),
@@ -423,8 +424,8 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
         "noise_alone": not counted,
         **fit.design(counted=counted),
     }
-    if any(assumed.values()):
-        yield Finding(Question.ASSUMED, _TRUSTED, "assumed", assumed)
+    if any(values.values()):
+        yield assumed("assumed", **values)
 
 
 RESERVATIONS: tuple[_Check, ...] = (

@@ -497,7 +497,10 @@ def _candidates(
     if problem.response is not None:
         reasons["asymmetry"] = _even(optimum)
         reasons["speed"] = _falling_force(optimum)
-        reasons["masing"] = _jenkins(optimum, fitted.misfit)
+        least = least_misfit(optimum)
+        helps = least is not None and least < FAR_LESS * fitted.misfit
+        would_leave = f"parallel Jenkins elements would leave {percent(least or 0.0)}"
+        reasons["masing"] = f"{would_leave} of the fundamental" if helps else ""
     exponent_is_assumed = any(p.assumed for e in model.elements for p in e.parameters)
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
         alternatives = [offered[name] for _, offered in offers if name in offered]
@@ -583,11 +586,3 @@ def _falling_force(optimum: Optimum) -> str:
         return ""
     f = view.omega[rows] / (2.0 * np.pi)
     return f"force falls by {percent(fall)} from {f.min():.3g} to {f.max():.3g} Hz"
-
-
-def _jenkins(optimum: Optimum, misfit: float) -> str:
-    """Return the misfit of parallel Jenkins elements where it is far smaller, else ""."""
-    least = least_misfit(optimum)
-    if least is None or not least < FAR_LESS * misfit:
-        return ""
-    return f"parallel Jenkins elements would leave {percent(least)} of the fundamental"

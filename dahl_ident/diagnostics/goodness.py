@@ -36,7 +36,7 @@ from dahl_ident.diagnostics.misfit_explanations import (
     is_at_end,
     neighbourhood,
     refitted_without,
-    rms_misfit,
+    rms_misfit_of,
     sign_convention,
     suspicious_points,
 )
@@ -380,7 +380,7 @@ def _tested(
         _smooth(errors) if within is None else None,
     )
     return Goodness(
-        rms_misfit(problem, optimum.theta),
+        rms_misfit_of(problem, problem.predict(optimum.theta)),
         tuple(physical_warnings(optimum)),
         flagged_rows(problem.data),
         tuple(test for test in tests if test is not None),

@@ -44,7 +44,7 @@ from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.contributions import satterthwaite
 from dahl_ident.diagnostics.error_sources import FEWEST_TESTS, rows_of_tests
 from dahl_ident.diagnostics.estimate import WeightedEstimate, tests_of
-from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
 from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState
 from dahl_ident.diagnostics.record_sources import blocks_of
 from dahl_ident.diagnostics.residual_space import orthonormal
@@ -178,7 +178,7 @@ class CrossValidation:
         """Return the check as a finding."""
         names = ("tests", "available", "gains", "phases", "rows", "width")
         values = {name: getattr(self, name) for name in names}
-        return Finding(Question.DESCRIBED, severity, "held_out", values)
+        return described("held_out", severity, **values)
 
     def __str__(self) -> str:
         return str(self.finding(VerdictStatus.TRUSTED))
@@ -275,7 +275,9 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
         relative = predicted / size
         members = run == np.arange(run.max() + 1)[:, None]
         scatter = [interleaved(members * x).T for x in (relative, 1j * data.harmonic * relative)]
-    stated, group = _stated_variances(optimum, size), np.repeat(~fundamental, 2).astype(np.intp)
+    stated, group = np.zeros(y.size), np.repeat(~fundamental, 2).astype(np.intp)
+    if problem.scale_known and data.covariance is not None:
+        stated = (np.diagonal(data.covariance, axis1=1, axis2=2) / size[:, None] ** 2).ravel()
     zero = np.repeat(data.harmonic == 0, 2) & (np.arange(y.size) % 2 == 1)  # of a mean
     kept = np.flatnonzero(~zero)
     _, group = np.unique(group[kept], return_inverse=True)
@@ -340,16 +342,6 @@ def _log_density(squares: float, volume: float, size: int, *, robust: bool) -> f
     if robust:
         squares = (_HEAVY + size) * float(np.log1p(squares / _HEAVY))
     return 0.5 * (volume - squares)
-
-
-def _stated_variances(optimum: Optimum, size: FloatArray) -> FloatArray:
-    """Return the stated relative variances of both parts, or zeros."""
-    problem = optimum.problem
-    covariance = problem.data.covariance
-    if not problem.scale_known or covariance is None:
-        return np.zeros(2 * problem.data.n)
-    both = np.diagonal(covariance, axis1=1, axis2=2) / size[:, None] ** 2
-    return np.asarray(both.ravel())
 
 
 def _densities(state: MixedState, test: IntArray, unit: FloatArray, *, robust: bool) -> FloatArray:

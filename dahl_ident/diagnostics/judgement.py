@@ -69,9 +69,16 @@ def described(
     return Finding(Question.DESCRIBED, severity, code, values)
 
 
-def undetermined(code: str, /, **values: Any) -> Finding:
-    """Return a finding about what the data do not determine."""
-    return Finding(Question.DETERMINED, VerdictStatus.NOT_DETERMINED, code, values)
+def determined(
+    code: str, severity: VerdictStatus = VerdictStatus.NOT_DETERMINED, /, **values: Any
+) -> Finding:
+    """Return a finding about what the data determine, or do not."""
+    return Finding(Question.DETERMINED, severity, code, values)
+
+
+def assumed(code: str, /, **values: Any) -> Finding:
+    """Return a finding about what the result depends on and the data cannot test."""
+    return Finding(Question.ASSUMED, VerdictStatus.TRUSTED, code, values)
 
 
 _MOST_SHOWN = 5  # findings of a verdict; more would not be read

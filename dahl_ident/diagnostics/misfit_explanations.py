@@ -185,13 +185,8 @@ SIGN_CHANGES = (
 )
 
 
-def rms_misfit(problem: TableProblem, theta: FloatArray) -> float:
-    """Return the root mean square of abs(measured - fitted)/abs(measured) of fundamentals."""
-    return rms_misfit_of(problem, problem.predict(theta))
-
-
 def rms_misfit_of(problem: TableProblem, fitted: ComplexArray) -> float:
-    """Return the same for given fitted responses, (n,)."""
+    """Return the root mean square of abs(measured - fitted)/abs(measured) of fundamentals."""
     return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
 

@@ -190,7 +190,9 @@ class Profiler:
         theta = np.tile(self._optimum.theta, (len(index), 1))
         tangent, origin = self._tangents[index], self._optimum.theta[index]
         was_reachable = np.zeros(len(index), dtype=np.bool_)
-        bracket = self._bracket(index, sign, target)
+        furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
+        step, width = self._first_step[index] * target, _NARROW * self._conditional[index]
+        bracket = Bracket(target, step, furthest, self._logarithmic[index], width)
         for _ in range(_CURVE_STEPS):
             a = bracket.active
             moved = sign[a] * bracket.position[a] + origin[a] - theta[a, index[a]]
@@ -205,13 +207,6 @@ class Profiler:
             if not bracket.active.size:
                 break
         return np.asarray(origin + sign * bracket.give_up())
-
-    def _bracket(self, index: IntArray, sign: FloatArray, target: FloatArray) -> Bracket:
-        origin = self._optimum.theta[index]
-        furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
-        step = self._first_step[index] * target
-        least_width = _NARROW * self._conditional[index]
-        return Bracket(target, step, furthest, self._logarithmic[index], least_width)
 
     def _from_best_start(
         self, index: IntArray, theta: FloatArray, change: FloatArray

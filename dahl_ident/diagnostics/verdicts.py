@@ -42,7 +42,7 @@ from dahl_ident.diagnostics.intervals import (
     search_coordinates,
     wald_intervals,
 )
-from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, determined
 from dahl_ident.fitting import Optimum
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
@@ -145,15 +145,11 @@ class Identifiability:
         """Which parameters or combinations are determined."""
         weak = tuple(self.named(Verdict.WEAK))
         if self.complete:
-            values = {
-                "identified": tuple(self.named(Verdict.IDENTIFIED)),
-                "weak": weak,
-                "by_prior": tuple(self.named(Verdict.BY_PRIOR)),
-            }
-            return Finding(Question.DETERMINED, VerdictStatus.TRUSTED, "identified", values)
+            identified, by_prior = map(self.named, (Verdict.IDENTIFIED, Verdict.BY_PRIOR))
+            known = {"identified": tuple(identified), "by_prior": tuple(by_prior)}
+            return determined("identified", VerdictStatus.TRUSTED, weak=weak, **known)
         lost = tuple(self.named(Verdict.NOT_IDENTIFIED))
-        values = {"determined": self.determined, "weak": weak, "lost": lost}
-        return Finding(Question.DETERMINED, VerdictStatus.NOT_DETERMINED, "undetermined", values)
+        return determined("undetermined", determined=self.determined, weak=weak, lost=lost)
 
     @property
     def headline(self) -> str:
@@ -215,7 +211,13 @@ def judged(
         intervals = wald_intervals(optimum, LEVELS)
     else:
         intervals = profile_of()
-    spread = np.maximum(fisher, _profile_std(optimum, intervals, natural)).tolist()
+    lower, upper = (
+        search_coordinates(optimum, ends[1]) for ends in (intervals.lower, intervals.upper)
+    )
+    (q,) = thresholds(optimum, np.array([LEVELS[1]]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_profile = (upper - lower) / (2.0 * q * natural)
+    spread = np.maximum(fisher, np.where(np.isnan(by_profile), np.inf, by_profile)).tolist()
     verdicts = {}
     for name, std in zip(problem.names, spread, strict=True):
         closed = np.isfinite(intervals[name][-1]).all() and std <= NOT_IDENTIFIED_ABOVE
@@ -352,18 +354,6 @@ def _exchanges(optimum: Optimum) -> Iterator[IntArray]:
                     for i, j in chosen:
                         order[[i, j]] = j, i
                     yield order
-
-
-def _profile_std(
-    optimum: Optimum, intervals: ConfidenceIntervals, natural: FloatArray
-) -> FloatArray:
-    """Return half the width of the 95.45 % interval over its threshold, in natural sizes."""
-    (q,) = thresholds(optimum, np.array([LEVELS[1]]))
-    lower = search_coordinates(optimum, intervals.lower[1])
-    upper = search_coordinates(optimum, intervals.upper[1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        std = (upper - lower) / (2.0 * q * natural)
-    return np.where(np.isnan(std), np.inf, std)
 
 
 def _combinations(

@@ -34,7 +34,7 @@ from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data.storage import library
 from dahl_ident.diagnostics.confidence_levels import checked_levels
-from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described, determined
 from dahl_ident.fitting.losses import TAIL_DOF
 
 if TYPE_CHECKING:
@@ -153,13 +153,9 @@ class PriorInfluence:
     def finding(self, severity: VerdictStatus) -> Finding:
         """Return the influence as a finding."""
         reached = {"lower": self.at_lower_end, "upper": self.at_upper_end}
-        values = {
-            "name": self.name,
-            "width": self.width,
-            "ends": tuple(end for end, is_reached in reached.items() if is_reached),
-            "contradicted": self.contradicted,
-        }
-        return Finding(Question.DETERMINED, severity, "prior_influence", values)
+        ends = tuple(end for end, is_reached in reached.items() if is_reached)
+        known = {"name": self.name, "width": self.width, "contradicted": self.contradicted}
+        return determined("prior_influence", severity, ends=ends, **known)
 
     def __str__(self) -> str:
         return str(self.finding(VerdictStatus.TRUSTED))
@@ -286,9 +282,8 @@ def contradictions(
 ) -> tuple[Finding, ...]:
     """Return findings that the data contradict the model: of the checks, or else of the fit."""
     if fit is None or by_checks:
-        lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
-        failed = (check for check in checks if not check.passed)
-        return tuple(Finding(*lost, "predictive_check", {"text": str(c)}) for c in failed)
+        failed, lost = (c for c in checks if not c.passed), VerdictStatus.NOT_DESCRIBED
+        return tuple(described("predictive_check", lost, text=str(check)) for check in failed)
     if fit.status is VerdictStatus.NOT_DETERMINED and fit.goodness.objections:
         return tuple(fit.goodness.findings())
     if fit.status is not VerdictStatus.NOT_DESCRIBED:

@@ -24,7 +24,14 @@ from dahl_ident.data.storage import plain_data
 from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at, quantities
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.checks import assumptions, reading
-from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import (
+    Finding,
+    Judgement,
+    VerdictStatus,
+    assumed,
+    described,
+    determined,
+)
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
 from dahl_ident.results.fit_result import FitResult
@@ -393,7 +400,7 @@ class Posterior(Result):
         converged, fit = self.converged, self.counted_fit
         severity = VerdictStatus.TRUSTED if converged else VerdictStatus.NOT_DETERMINED
         code = "sampled" if converged else "not_converged"
-        yield Finding(Question.DETERMINED, severity, code, {"message": self.message})
+        yield determined(code, severity, message=self.message)
         lost = VerdictStatus.NOT_DESCRIBED if converged else VerdictStatus.NOT_DETERMINED
         for influence in self.prior_influences:
             by_default = influence.name in self.default_priors
@@ -411,18 +418,15 @@ class Posterior(Result):
             if counted:
                 free = (n for n in self.names if n not in (*fit.problem.names, SCALE))
                 ranges = (f"{name} as a parameter, which was not given" for name in free)
-                sources = {"sources": (*self.counted, *ranges)}
-                yield Finding(Question.ASSUMED, VerdictStatus.TRUSTED, "counted", sources)
+                yield assumed("counted", sources=(*self.counted, *ranges))
             elif fit.errors is not None:
                 std = zip(self.names, self.std().tolist(), strict=True)
                 known = ((n, s) for n, s in std if n in fit.var_names)
                 u = [f"{fit.params[n].stderr:.2g} for {n} (here {s:.2g})" for n, s in known]
-                values = {"compared": tuple(u)}
-                yield Finding(Question.ASSUMED, VerdictStatus.TRUSTED, "noise_alone", values)
+                yield assumed("noise_alone", compared=tuple(u))
             yield from assumptions(fit.assessment, counted=counted)
         if not self.is_chain and self.normalised:
-            evidence = {"ln": self.log_evidence}
-            yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", evidence)
+            yield described("evidence", ln=self.log_evidence)
 
     @property
     def counted_fit(self) -> FitResult | None:
