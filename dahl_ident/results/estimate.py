@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.bayes.chain import ChainSettings, Pool
+from dahl_ident.bayes.chain import LENGTH, Chain, ChainSettings, Convergence, Listener, Pool
 from dahl_ident.bayes.density import Density, LogDensity, RecordDensity
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.sample import (
@@ -39,11 +39,12 @@ from dahl_ident.problem import (
     problem_of,
     refuse_options,
 )
+from dahl_ident.progress import spinner
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
-from dahl_ident.results.progress import chain_progress, fit_progress, grid_progress
 from dahl_ident.sensors import Sensors
+from dahl_ident.units import counted, percent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -156,15 +157,12 @@ def fit(
     >>> result.params["f_max"].value.__round__(9), result.success
     (0.1, True)
     """
-    refuse_options(problem_class(data), locals(), fit)
+    options = {**locals()}
+    refuse_options(problem_class(data), options, fit)
     if method not in ("lm", "scipy", "ipopt"):
         raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
-    ipopt_options: dict[str, Any] = {
-        "constraints": constraints,
-        "drive_std": drive_std,
-        "drive_covariance": drive_covariance,
-    }
-    given = [name for name, value in ipopt_options.items() if value is not None]
+    of_ipopt = {name: options[name] for name in ("constraints", "drive_std", "drive_covariance")}
+    given = [name for name, value in of_ipopt.items() if value is not None]
     if given and method != "ipopt":
         raise ValidationError(
             f"{' and '.join(given)} given; only {argument('method', 'ipopt')} takes that"
@@ -186,13 +184,13 @@ def fit(
         excitation=excitation,
     )
     try:
-        with fit_progress() if progress else nullcontext() as tell:
+        with _fit_progress() if progress else nullcontext() as tell:
             if method != "ipopt":
                 optimum = solve(problem, method=method, loss=loss, start=start, tell=tell)
             else:
                 from dahl_ident.fitting.ipopt import solve_ipopt
 
-                optimum = solve_ipopt(problem, start=start, loss=loss, tell=tell, **ipopt_options)
+                optimum = solve_ipopt(problem, start=start, loss=loss, tell=tell, **of_ipopt)
             result = FitResult(optimum, first_order=constraints is not None)
     except FitInterrupted as stop:
         raise FitInterrupted(
@@ -409,7 +407,7 @@ def posterior(
             noise=noise,
             steady=steady or "exact",
         )
-        with fit_progress() if progress else nullcontext() as tell:
+        with _fit_progress() if progress else nullcontext() as tell:
             optimum = optimum_of(problem, tell)
         fitted = None if optimum is None else FitResult(optimum)
     if fitted is None or likelihood != "gaussian":
@@ -417,7 +415,7 @@ def posterior(
     density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
     begin = partial(centre_and_covariance, density, optimum, np.random.default_rng(0))
     if method == "grid":
-        with grid_progress() if progress else nullcontext() as show:
+        with _grid_progress() if progress else nullcontext() as show:
             points = sample_points(density, begin, problem.names, tolerance, show)
         return Posterior(density, points, fitted, uncertainty)
     settings = ChainSettings(
@@ -430,7 +428,7 @@ def posterior(
         ensembles=ensembles,
     )
     start = partial(starting_points, density, optimum)
-    with chain_progress(settings) if progress else nullcontext() as bar:
+    with _chain_progress(settings) if progress else nullcontext() as bar:
         sample = sample_chain(
             density,
             start,
@@ -443,6 +441,38 @@ def posterior(
     result = Posterior(density, sample, fitted, uncertainty)
     sample.check(result.names, result)
     return result
+
+
+@contextmanager
+def _chain_progress(settings: ChainSettings) -> Iterator[Listener]:
+    """Yield a listener that shows the number of steps, and the expected total once it is known."""
+    with spinner("sampling", patience=0.0) as show:
+
+        def update(chain: Chain, verdict: Convergence | None) -> None:
+            total = settings.steps
+            if total is None and verdict is not None and verdict.usable:
+                kept = verdict.steps - verdict.discard
+                needed = max(LENGTH * verdict.tau.max(), kept * settings.ess / verdict.ess.min())
+                total = max(min(verdict.discard + int(needed) + 1, settings.max_steps), chain.steps)
+            show(f" {chain.steps}/{total or '?'}", chain.steps, total)
+
+        yield update
+
+
+@contextmanager
+def _fit_progress() -> Iterator[Callable[[int, float], None]]:
+    """Yield a function that shows evaluations and unexplained share of variance after 2 s."""
+    with spinner("fitting") as show:
+        yield lambda evaluations, share: show(
+            f": {counted(evaluations, 'evaluation')}, {percent(share**0.5, 3)} rms left"
+        )
+
+
+@contextmanager
+def _grid_progress() -> Iterator[Callable[[int], None]]:
+    """Yield a function that shows the number of points after 2 s."""
+    with spinner("integrating") as show:
+        yield lambda points: show(f": {counted(points, 'point')}")
 
 
 _NOT_OF_METHODS = {
