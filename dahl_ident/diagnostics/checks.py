@@ -395,8 +395,7 @@ def _few_runs(fit: Assessed) -> Iterator[Finding]:
         dof = min((r.dof for b in budgets for r in b.rows if r.source == RUNS), default=np.inf)
         k = max(b.k for b in budgets)
         if dof < _FEW_RUNS and k > _WIDE:
-            values = {"k": k, "runs": 1 + round(dof)}
-            yield Finding(Question.ASSUMED, _TRUSTED, "few_runs", values)
+            yield assumed("few_runs", k=k, runs=1 + round(dof))
 
 
 def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
