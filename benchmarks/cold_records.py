@@ -20,13 +20,16 @@ from tests.cold_records import Case
 
 SEEDS = 6
 CASES: dict[str, Callable[[int], Case]] = {
-    **{f"Dahl, driven, sigma {s:g} N/m": partial(cold.fast, s) for s in (300.0, 3e3, 3e4)},
-    **{f"Backlash, gap {g:g} x_c, force measured": partial(cold.play, g) for g in (0.5, 2.0, 6.0)},
+    **{f"Dahl, driven, sigma {s:g} N/m": partial(cold.driven_dahl, s) for s in (300.0, 3e3, 3e4)},
+    **{
+        f"Backlash, gap {g:g} x_c, force measured": partial(cold.backlash, g)
+        for g in (0.5, 2.0, 6.0)
+    },
     "LuGre, driven": cold.lugre,
-    "Maxwell slip, driven": cold.slips,
+    "Maxwell slip, driven": cold.maxwell_slip,
     "Iwan, driven": cold.iwan,
     **{
-        f"{name}, free decay, {known} known": partial(cold.decay, name, known)
+        f"{name}, free decay, {known} known": partial(cold.free_decay, name, known)
         for name in cold.DECAYS
         for known in ("mass", "spring")
     },

@@ -14,8 +14,8 @@ true one, because its phase is referred to k times the force's.
 
 A gain also affects the amplitudes of a table: the true amplitude is the measured one divided by
 `displacement_gain`, and the true drive is the measured one divided by `force_gain`. For friction
-without other elements, an unknown force gain therefore leaves only x_c determined, and an unknown
-displacement gain only f_max.
+without other elements, only x_c is therefore determined if the force gain is unknown, and only
+f_max if the displacement gain is unknown.
 """
 
 from __future__ import annotations

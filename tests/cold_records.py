@@ -1,4 +1,4 @@
-"""Records from independent solvers, that a fit has to solve without any start."""
+"""Records from independent solvers, which a fit has to describe without a start."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Wave = Callable[[float], float]
 
 
 class Case(NamedTuple):
-    """A record, the plant that it is of, and the model that is asked."""
+    """A record, the plant that made it, and the model to be fitted."""
 
     record: di.Record
     truth: Model
@@ -35,7 +35,7 @@ class Case(NamedTuple):
 def multisine(
     samples: int, rate: float, low: float, high: float, rms: float, seed: int
 ) -> tuple[FloatArray, Wave]:
-    """Return a whole period of equal lines with random phases, and the wave as a function."""
+    """Return the samples of one period of a multisine, and its value as a function of time."""
     rng = np.random.default_rng(seed)
     f = np.arange(1, samples // 2) * rate / samples
     f = f[(f >= low) & (f <= high)]
@@ -47,11 +47,11 @@ def multisine(
     return np.array([wave(i / rate) for i in range(samples)]), wave
 
 
-def moved(
+def simulated(
     law: HandLaw, linear: tuple[float, float, float], drive: Wave, samples: int, rate: float,
     first: float = 0.0, stiff: bool = False,
 ) -> FloatArray:  # fmt: skip
-    """Return the states of a law with mass, damper and spring, by scipy."""
+    """Return displacement, velocity and states of a law with mass, damper and spring, by scipy."""
     plant = Oracle([law], lambda t: (drive(t), 0.0), False, *linear)
 
     def rates(t: float, y: FloatArray) -> list[float]:
@@ -59,52 +59,53 @@ def moved(
         return plant.rates(t, y, sides)
 
     t = np.arange(samples) / rate
-    found = solve_ivp(
+    solution = solve_ivp(
         rates, (0.0, t[-1]), [first, *np.zeros(1 + law.n)], "Radau" if stiff else "DOP853",
         t_eval=t, rtol=1e-8, atol=1e-11, max_step=0.5 / rate,
     )  # fmt: skip
-    assert found.success
-    return np.asarray(found.y)
+    assert solution.success
+    return np.asarray(solution.y)
 
 
 def noisy(x: FloatArray, share: float, seed: int) -> FloatArray:
-    return np.asarray(
-        x + share * x.std() * np.random.default_rng(seed + 1000).standard_normal(x.size)
-    )
+    """Return a wave with noise, a share of its standard deviation."""
+    noise = np.random.default_rng(seed + 1000).standard_normal(x.size)
+    return np.asarray(x + share * x.std() * noise)
 
 
-def case(
+def driven_case(
     truth: Element, model: Element, linear: tuple[float, float, float], x: FloatArray,
     force: FloatArray, rate: float, seed: int, noise: float = 1e-3,
 ) -> Case:  # fmt: skip
-    """Return a record of a driven plant's displacement, of which nothing is known."""
+    """Return the displacement of a driven plant with unknown mass, damping and stiffness."""
     m, c, k = linear
     record = di.Record(np.arange(x.size) / rate, displacement=noisy(x, noise, seed), force=force)
     whole = truth + di.Mass(m) + di.Damper(c) + di.Spring(k)
     return Case(record, whole, model + di.Mass() + di.Damper() + di.Spring())
 
 
-def fast(sigma: float, seed: int, n: int = 768) -> Case:
-    """Return friction whose x_c/v is far below the sampling interval where sigma is high."""
+def driven_dahl(sigma: float, seed: int, n: int = 768) -> Case:
+    """Return Dahl friction; for a high sigma, x_c/v is far below the sampling interval."""
     rate, f_max, linear = 100.0, 0.5, (1.0, 1.0, 400.0)
     force, drive = multisine(n, rate, 0.3, 7.7, 3.0, seed)
-    x = moved(DahlByHand(f_max, sigma), linear, drive, n, rate, stiff=sigma > 1000.0)[0]
-    return case(di.Dahl(f_max, sigma), di.Dahl(), linear, x, force, rate, seed)
+    x = simulated(DahlByHand(f_max, sigma), linear, drive, n, rate, stiff=sigma > 1000.0)[0]
+    return driven_case(di.Dahl(f_max, sigma), di.Dahl(), linear, x, force, rate, seed)
 
 
-def accelerated(seed: int, n: int = 1024) -> Case:
+def with_accelerometer(seed: int) -> Case:
     """Return friction with an accelerometer, whose displacement drifts below the drive's band."""
-    rate, f_max, sigma, linear = 1000.0, 1.0, 2e4, (0.5, 4.0, 2000.0)
+    n, rate, f_max, sigma, linear = 1024, 1000.0, 1.0, 2e4, (0.5, 4.0, 2000.0)
     force, drive = multisine(n, rate, 1.0, 40.0, 3.0, seed)
-    x, v, friction = moved(DahlByHand(f_max, sigma), linear, drive, n, rate)
+    x, v, friction = simulated(DahlByHand(f_max, sigma), linear, drive, n, rate)
     m, c, k = linear
     a = noisy((force - c * v - k * x - friction) / m, 1e-3, seed)
-    made = case(di.Dahl(f_max, sigma), di.Dahl(), linear, x, force, rate, seed)
-    return made._replace(record=di.Record(made.record.time, acceleration=a, force=force))
+    by_displacement = driven_case(di.Dahl(f_max, sigma), di.Dahl(), linear, x, force, rate, seed)
+    record = di.Record(by_displacement.record.time, acceleration=a, force=force)
+    return by_displacement._replace(record=record)
 
 
-def play(gap: float, seed: int) -> Case:
-    """Return linear Dahl friction behind a gap of so many x_c, its displacement measured."""
+def backlash(gap: float, seed: int) -> Case:
+    """Return the force of Dahl friction behind a gap of `gap` x_c, for a measured displacement."""
     n, f_max, sigma = 2000, 0.1, 30.0
     x_c = f_max / sigma
     rng = np.random.default_rng(seed)
@@ -124,7 +125,7 @@ LINEAR = (0.3, 0.5, 50.0)
 
 
 def lugre(seed: int, speed: float = 0.20, noise: float = 1e-3) -> Case:
-    """Return a driven plant with LuGre friction whose speed is on both sides of Stribeck's.
+    """Return a driven plant with LuGre friction, slower and faster than the Stribeck speed.
 
     `speed` is in m/s rms.
     """
@@ -136,24 +137,24 @@ def lugre(seed: int, speed: float = 0.20, noise: float = 1e-3) -> Case:
     def scaled(t: float) -> float:
         return scale * drive(t)
 
-    for _ in range(2):  # the drive of that speed
-        scale *= speed / float(moved(law, LINEAR, scaled, n, rate)[1].std())
-    x = moved(law, LINEAR, scaled, n, rate)[0]
+    for _ in range(2):  # scale the drive to that speed
+        scale *= speed / float(simulated(law, LINEAR, scaled, n, rate)[1].std())
+    x = simulated(law, LINEAR, scaled, n, rate)[0]
     truth = di.LuGre(f_max, sigma, ratio, v_s)
-    return case(truth, di.LuGre(), LINEAR, x, scale * force, rate, seed, noise)
+    return driven_case(truth, di.LuGre(), LINEAR, x, scale * force, rate, seed, noise)
 
 
-def slips(seed: int, samples: int = 512) -> Case:
+def maxwell_slip(seed: int) -> Case:
     """Return a driven plant with Jenkins elements of known slips."""
-    rate, k, d = 500.0, [200.0, 100.0], [1e-3, 4e-3]
+    samples, rate, k, d = 512, 500.0, [200.0, 100.0], [1e-3, 4e-3]
     force, drive = multisine(samples, rate, 2.0, 40.0, 1.0, seed)
-    x = moved(JenkinsByHand(k, d), LINEAR, drive, samples, rate)[0]
-    return case(di.MaxwellSlip(d, k), di.MaxwellSlip(d), LINEAR, x, force, rate, seed)
+    x = simulated(JenkinsByHand(k, d), LINEAR, drive, samples, rate)[0]
+    return driven_case(di.MaxwellSlip(d, k), di.MaxwellSlip(d), LINEAR, x, force, rate, seed)
 
 
-def unknown_slips(seed: int, count: int = 3, samples: int = 1000) -> Case:
-    """Return the force of Jenkins elements, drawn at random, under four sines of displacement."""
-    rng = np.random.default_rng(seed)
+def unknown_slips(seed: int) -> Case:
+    """Return the force of three random Jenkins elements under four sines of displacement."""
+    rng, count, samples = np.random.default_rng(seed), 3, 1000
     t = np.arange(samples) / 100.0
     f, phase = np.exp(rng.uniform(np.log(0.4), np.log(4.0), 4)), 2.0 * np.pi * rng.random(4)
     x = np.sin(2.0 * np.pi * np.outer(t, f) + phase).sum(axis=1)
@@ -168,26 +169,28 @@ def unknown_slips(seed: int, count: int = 3, samples: int = 1000) -> Case:
     return Case(record, Model(di.MaxwellSlip(d.tolist(), k.tolist())), Model(di.MaxwellSlip(count)))
 
 
-def joint(f_max: float, sigma: float, chi: float, ratio: float) -> tuple[FloatArray, FloatArray]:
+def iwan_elements(
+    f_max: float, sigma: float, chi: float, ratio: float
+) -> tuple[FloatArray, FloatArray]:
     """Return stiffnesses and slips of 400 Jenkins elements on Segalman's backbone curve.
 
     F(x) = sigma x (1 - (x/d)^(chi + 1)/((1 + ratio)(chi + 2))) up to F(d) = f_max.
     """
-    last = 1.0 / ((1.0 + ratio) * (chi + 2.0))
-    d = f_max / (sigma * (1.0 - last))
+    loss = 1.0 / ((1.0 + ratio) * (chi + 2.0))
+    d = f_max / (sigma * (1.0 - loss))
     x = d * np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 400)])
-    slope = np.diff(sigma * x * (1.0 - (x / d) ** (chi + 1.0) * last)) / np.diff(x)
+    slope = np.diff(sigma * x * (1.0 - (x / d) ** (chi + 1.0) * loss)) / np.diff(x)
     return slope - np.append(slope[1:], 0.0), x[1:]
 
 
-def sliding(
-    k: FloatArray, d: FloatArray, first: float, drive: Wave, samples: int, rate: float,
-    substeps: int = 40,
-) -> FloatArray:  # fmt: skip
+def simulated_elements(
+    k: FloatArray, d: FloatArray, first: float, drive: Wave, samples: int, rate: float
+) -> FloatArray:
     """Return displacements of m = 0.3, c = 0.5, k = 50 with Jenkins elements, by small steps.
 
-    Each element is exact over a step; the plant goes by velocity Verlet.
+    The elements are exact over a step; the plant is integrated by the velocity Verlet method.
     """
+    substeps = 40
     h = 1.0 / rate / substeps
     x, v, f, out = first, 0.0, np.zeros(k.size), np.empty(samples)
     force = drive(0.0)
@@ -202,12 +205,12 @@ def sliding(
     return out
 
 
-def iwan(seed: int, samples: int = 384) -> Case:
+def iwan(seed: int) -> Case:
     """Return a driven plant with Segalman's four-parameter Iwan friction."""
-    rate = 500.0
+    samples, rate = 384, 500.0
     force, drive = multisine(samples, rate, 2.0, 40.0, 1.0, seed)
-    x = sliding(*joint(0.3, 200.0, -0.5, 0.5), 0.0, drive, samples, rate)
-    return case(di.Iwan(0.3, 200.0, -0.5, 0.5), di.Iwan(), LINEAR, x, force, rate, seed)
+    x = simulated_elements(*iwan_elements(0.3, 200.0, -0.5, 0.5), 0.0, drive, samples, rate)
+    return driven_case(di.Iwan(0.3, 200.0, -0.5, 0.5), di.Iwan(), LINEAR, x, force, rate, seed)
 
 
 DECAYS: dict[str, tuple[Element, Element, HandLaw | None]] = {
@@ -230,17 +233,17 @@ DECAYS: dict[str, tuple[Element, Element, HandLaw | None]] = {
         di.MaxwellSlip([3e-4, 2e-3], [200.0, 30.0]), di.MaxwellSlip([3e-4, 2e-3]),
         JenkinsByHand([200.0, 30.0], [3e-4, 2e-3]),
     ),
-    "iwan": (di.Iwan(0.1, 200.0, -0.5, 0.5), di.Iwan(), None),  # by many elements
+    "iwan": (di.Iwan(0.1, 200.0, -0.5, 0.5), di.Iwan(), None),  # simulated by many elements
     "power_damper": (di.PowerDamper(0.3, 0.5), di.PowerDamper(), PowerDamperByHand(0.3, 0.5)),
     "backlash": (
         di.Backlash(di.Dahl(0.1, 300.0), 2e-3), di.Backlash(di.Dahl()),
         DahlByHand(0.1, 300.0, gap=2e-3),
     ),
 }  # fmt: skip
-"""A law, what is asked of it, and the law by hand."""
+"""A law, the law to be fitted, and the law by hand."""
 
 
-def decay(name: str, known: str, seed: int, samples: int = 600) -> Case:
+def free_decay(name: str, known: str, seed: int, samples: int = 600) -> Case:
     """Return a free decay of m = 0.3, k = 50 from 20 mm; either the mass or the spring is known."""
     rate = 250.0
     truth, model, law = DECAYS[name]
@@ -250,9 +253,9 @@ def decay(name: str, known: str, seed: int, samples: int = 600) -> Case:
         return 0.0
 
     if law is None:
-        x = sliding(*joint(0.1, 200.0, -0.5, 0.5), 0.02, drive, samples, rate)
+        x = simulated_elements(*iwan_elements(0.1, 200.0, -0.5, 0.5), 0.02, drive, samples, rate)
     else:
-        x = moved(law, (0.3, damping, 50.0), drive, samples, rate, first=0.02)[0]
+        x = simulated(law, (0.3, damping, 50.0), drive, samples, rate, first=0.02)[0]
     record = di.Record(
         np.arange(samples) / rate, displacement=noisy(x, 1e-3, seed), force=np.zeros(samples)
     )

@@ -14,7 +14,8 @@ from dahl_ident.bayes.chain import autocorrelation_time, judge, r_hat
 from dahl_ident.bayes.moves import EnsembleMove, differential_evolution, independent, snooker
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.problem import TableProblem
-from tests.bayes_cases import FRICTION, friction_table, spring_table
+from tests.bayes_cases import friction_table, spring_table
+from tests.friction_tables import FRICTION
 
 
 def autoregression(steps, walkers, rho, seed=3):

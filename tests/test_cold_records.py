@@ -1,6 +1,7 @@
-"""Records that a fit solves without a start; independent solvers made them."""
+"""Records that a fit describes without a start; independent solvers made them."""
 
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,42 +13,49 @@ from tests.recovery import assert_near
 
 
 def assert_found(case):
-    """Check every free parameter: within three standard uncertainties, which say something."""
+    """Check that every free parameter is within three standard uncertainties, none above 30 %."""
     fit = di.fit(case.record, case.model, throw=False)
     assert fit.success, fit.verdict
     assert fit.status.usable, fit.verdict
     assert_near(fit, case.truth, 3.0, 0.3)
 
 
-@pytest.mark.parametrize(
-    ("sigma", "seed", "samples"),
-    [(30000.0, 0, 320), pytest.param(30000.0, 3, 768, marks=pytest.mark.long)],
-)
-def test_friction_faster_than_the_sampling(sigma, seed, samples):
-    assert_found(cold.fast(sigma, seed, samples))
+CASES = {
+    "friction faster than the sampling": partial(cold.driven_dahl, 30000.0, 0, 320),
+    "accelerometer": partial(cold.with_accelerometer, 1),
+    "backlash": partial(cold.backlash, 2.0, 1),
+    "driven LuGre": partial(cold.lugre, 0),
+    "driven Maxwell slip": partial(cold.maxwell_slip, 1),
+    "first states are searched again": partial(cold.free_decay, "maxwell_slip", "spring", 5),
+    **{
+        f"decay, {name}": partial(
+            cold.free_decay, name, ("mass", "spring")[i % 2], 1, 300 if name == "iwan" else 600
+        )
+        for i, name in enumerate(cold.DECAYS)
+    },
+}
+LONG_CASES = {
+    "friction faster than the sampling, 3": partial(cold.driven_dahl, 30000.0, 3, 768),
+    **{f"accelerometer, {seed}": partial(cold.with_accelerometer, seed) for seed in range(2, 8)},
+    "backlash, 0.5 x_c": partial(cold.backlash, 0.5, 0),
+    "backlash, 6 x_c": partial(cold.backlash, 6.0, 2),
+    "driven Iwan": partial(cold.iwan, 1),
+}
 
 
 @pytest.mark.parametrize(
-    "seed", [1, *(pytest.param(i, marks=pytest.mark.long) for i in range(2, 8))]
-)
-def test_friction_with_an_accelerometer(seed):
-    assert_found(cold.accelerated(seed))
-
-
-@pytest.mark.parametrize(
-    ("gap", "seed"),
+    "make_case",
     [
-        (2.0, 1),
-        pytest.param(0.5, 0, marks=pytest.mark.long),
-        pytest.param(6.0, 2, marks=pytest.mark.long),
+        *(pytest.param(make, id=name) for name, make in CASES.items()),
+        *(pytest.param(m, id=name, marks=pytest.mark.long) for name, m in LONG_CASES.items()),
     ],
 )
-def test_backlash_with_measured_displacement(gap, seed):
-    assert_found(cold.play(gap, seed))
+def test_a_record_is_described_without_a_start(make_case):
+    assert_found(make_case())
 
 
 def assert_lowest(case):
-    """Check that no search from the truth ends lower than a cold one by more than chance."""
+    """Check that a search from the truth does not end significantly lower than one without it."""
     cold_fit = di.fit(case.record, case.model, throw=False)
     assert cold_fit.status.usable, cold_fit.verdict
     varied = [p for p in case.truth.parameters if cold_fit.params[p.name].vary]
@@ -58,37 +66,22 @@ def assert_lowest(case):
 
 
 def seeds(*short):
-    """Return 30 seeds, all but some for long runs alone."""
+    """Return 30 seeds; all but `short` are for long runs."""
     return [i if i in short else pytest.param(i, marks=pytest.mark.long) for i in range(30)]
 
 
 @pytest.mark.parametrize("seed", seeds(0, 6))
-def test_slips_that_are_unknown(seed):
+def test_unknown_slips(seed):
     assert_lowest(cold.unknown_slips(seed))
 
 
 @pytest.mark.parametrize("seed", seeds(0))
-def test_a_stribeck_speed_in_much_noise(seed):
+def test_a_stribeck_speed_with_much_noise(seed):
     assert_lowest(cold.lugre(seed, speed=0.06, noise=1e-2))
 
 
-@pytest.mark.parametrize(
-    ("made", "seed"),
-    [(cold.lugre, 0), (cold.slips, 1), pytest.param(cold.iwan, 1, marks=pytest.mark.long)],
-)
-def test_driven_plants(made, seed):
-    assert_found(made(seed))
-
-
-@pytest.mark.parametrize(
-    ("name", "known"), [(name, ("mass", "spring")[i % 2]) for i, name in enumerate(cold.DECAYS)]
-)
-def test_free_decays(name, known):
-    assert_found(cold.decay(name, known, 1, 300 if name == "iwan" else 600))
-
-
 class StiffnessFirst(di.Friction):
-    """Jenkins' element with its parameters in the order of a user."""
+    """A Jenkins element whose stiffness is declared first."""
 
     parameters = (
         di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
@@ -101,7 +94,7 @@ class StiffnessFirst(di.Friction):
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
-def test_an_own_law_at_any_scale_whatever_the_order_of_its_parameters(scale):
+def test_a_law_of_a_user_at_any_scale_with_its_stiffness_first(scale):
     t = np.arange(600) / 100.0
     x = 3e-3 * scale * (np.sin(6.0 * t) + np.sin(21.3 * t))
     force = np.zeros(t.size)
@@ -121,47 +114,30 @@ def with_gap(record, low, high):
     )
 
 
-def test_a_gap_in_a_driven_record_makes_two_parts():
-    case = cold.fast(300.0, 0)
-    said = r"nothing is known from 3\.49 to 4\.3 s; 2 parts are fitted, each from a first state"
+@pytest.mark.parametrize(
+    ("make_case", "low", "high"),
+    [
+        pytest.param(partial(cold.driven_dahl, 300.0, 0), 350, 430, id="driven Dahl"),
+        # springs have forces of their own after the gap
+        pytest.param(partial(cold.maxwell_slip, 414), 200, 260, id="Maxwell slip, 414"),
+        pytest.param(partial(cold.maxwell_slip, 416), 200, 260, id="Maxwell slip, 416"),
+        # beyond full slip the load has no effect, and a search from there once ended 7 u off
+        pytest.param(partial(cold.iwan, 3), 150, 200, id="Iwan"),
+        # the second part is much smaller than the first, the noise the same
+        pytest.param(partial(cold.free_decay, "dahl", "spring", 2), 120, 180, id="free decay"),
+        pytest.param(partial(cold.backlash, 2.0, 412), 700, 1100, id="backlash"),
+    ],
+)
+def test_a_record_with_a_gap_is_fitted_in_two_parts(make_case, low, high):
+    case = make_case()
+    said = r"nothing is known from [\d.]+ to [\d.]+ s; 2 parts are fitted, each from a first state"
     with pytest.warns(DataWarning, match=said):
-        assert_found(case._replace(record=with_gap(case.record, 350, 430)))
+        assert_found(case._replace(record=with_gap(case.record, low, high)))
 
 
-@pytest.mark.parametrize("seed", [414, 416])
-def test_springs_have_forces_of_their_own_after_a_gap(seed):
-    case = cold.slips(seed)
-    with pytest.warns(DataWarning, match="2 parts are fitted"):
-        assert_found(case._replace(record=with_gap(case.record, 200, 260)))
-
-
-def test_iwan_is_loaded_within_full_slip_after_a_gap():
-    """Beyond it the load has no effect, and a search from there once ended 7 u off."""
-    case = cold.iwan(3)
-    with pytest.warns(DataWarning, match="2 parts are fitted"):
-        assert_found(case._replace(record=with_gap(case.record, 150, 200)))
-
-
-def test_first_states_are_begun_again_as_long_as_it_helps():
-    assert_found(cold.decay("maxwell_slip", "spring", 5))
-
-
-def test_a_free_decay_goes_on_after_a_gap():
-    """The second part is much smaller than the first, the noise the same."""
-    case = cold.decay("dahl", "spring", 2)
-    with pytest.warns(DataWarning, match="2 parts are fitted"):
-        assert_found(case._replace(record=with_gap(case.record, 120, 180)))
-
-
-def test_friction_slips_behind_a_gap_where_a_record_goes_on():
-    case = cold.play(2.0, 412)
-    with pytest.warns(DataWarning, match="2 parts are fitted"):
-        assert_found(case._replace(record=with_gap(case.record, 700, 1100)))
-
-
-def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers():
-    """In the gap the displacement turns several times: a straight way through it is wrong."""
-    case = cold.play(0.5, 0)
+def test_a_gap_in_a_force_record_is_not_bridged_if_the_law_has_memory():
+    """The displacement turns several times in the gap, so a straight line through it is wrong."""
+    case = cold.backlash(0.5, 0)
     record = with_gap(case.record, 400, 700)
     with pytest.warns(DataWarning, match=r"nothing is known from 1\.995 to 3\.5 s"):
         fit = di.fit(record, case.model)
@@ -173,7 +149,7 @@ def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers():
     assert again.verdict == fit.verdict
 
 
-def test_a_gap_is_bridged_where_nothing_remembers():
+def test_a_gap_is_bridged_if_no_element_has_memory():
     t = np.delete(np.arange(400) / 100.0, slice(150, 220))
     x = 1e-3 * np.sin(7.0 * t)
     force = 50.0 * x + 1e-4 * np.random.default_rng(0).standard_normal(t.size)
@@ -184,7 +160,7 @@ def test_a_gap_is_bridged_where_nothing_remembers():
     assert fit.params["stiffness"].value == pytest.approx(50.0, rel=0.01)
 
 
-def test_short_parts_are_left_out_and_uneven_times_are_no_gaps():
+def test_short_parts_are_left_out_and_uneven_times_are_not_gaps():
     x = 1e-2 * np.cumsum(np.random.default_rng(0).standard_normal(500))
     force = di.Dahl(0.1, 30.0).force(x) + 1e-3 * np.random.default_rng(1).standard_normal(500)
     t = np.arange(500) / 100.0

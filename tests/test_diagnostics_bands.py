@@ -11,6 +11,7 @@ import dahl_ident as di
 from dahl_ident import extract, fit, load_dataset
 from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.errors import ModelError, ValidationError
+from tests.derivatives import central_differences
 from tests.friction_tables import F_MAX, X_C, amplitudes, plant_table, table
 from tests.measured import cranks, needs_measured
 
@@ -75,15 +76,9 @@ class TestBands:
         assert result.errors is None  # noise alone
         band = result.predict(result.data.frequency_hz, drive=result.data.drive, noise=False)
         np.testing.assert_allclose(band.response, result.best_fit, rtol=1e-9)
-        theta, step = result.optimum.theta, 1e-6
-        gradient = []
-        for i in range(len(theta)):
-            moved = [theta.copy(), theta.copy()]
-            moved[0][i] += step
-            moved[1][i] -= step
-            up, down = (np.log(result.problem.predict(m)) for m in moved)
-            gradient.append((up - down) / (2.0 * step))
-        d = np.array(gradient)
+        d = central_differences(
+            lambda theta: np.log(result.problem.predict(theta)), result.optimum.theta, 1e-6
+        )
         expected = np.sqrt(np.einsum("in,ij,jn->n", d.imag, result.optimum.covariance, d.imag))
         np.testing.assert_allclose(band.phase_std, expected, rtol=1e-5)
 
@@ -210,11 +205,9 @@ class TestDerived:
         assert found["equivalent stiffness"].value == pytest.approx(stiffness, rel=1e-12)
         damping = energy / (np.pi * A**2 * omega)
         assert found["equivalent damping"].value == pytest.approx(damping, rel=1e-12)
-        by_f, by_s = (
-            (self.energy(f * a, s * b, A) - self.energy(f / a, s / b, A)) / 2e-6
-            for a, b in ((1.0 + 1e-6, 1.0), (1.0, 1.0 + 1e-6))
+        slope = central_differences(
+            lambda factors: self.energy(f * factors[0], s * factors[1], A), [1.0, 1.0], 1e-6
         )
-        slope = np.array([by_f, by_s])
         expected = np.sqrt(slope @ result.optimum.covariance @ slope)
         assert found["energy lost in a cycle"].stderr == pytest.approx(expected, rel=1e-5)
 

@@ -37,6 +37,7 @@ from dahl_ident.engine import (
     translate,
 )
 from dahl_ident.errors import FitError
+from tests.derivatives import central_differences
 from tests.motions import Driven
 
 F_MAX = Parameter("f_max", "N", "limit", lower=0.0, transform="log")
@@ -345,14 +346,9 @@ def test_derivatives_of_loops_with_a_kink_at_a_speed(law):
     for kernel in (loops, settled):
         result = kernel(*arguments, chosen=range(3), harmonics=orders)
         assert np.max(np.abs(result.harmonics[0] - expected(values, A))) < 1e-9 * size
-        for i in range(3):
-            step = np.zeros(3)
-            step[i] = 1e-5 * values[i]
-            difference = (expected(values + step, A) - expected(values - step, A)) / 2e-5
-            computed = result.by_parameter[0, :, i] * values[i]
-            assert np.max(np.abs(computed - difference)) < 1e-6 * size
-        difference = (expected(values, 1.00001 * A) - expected(values, 0.99999 * A)) / 2e-5
-        assert np.max(np.abs(result.by_amplitude[0] * A - difference)) < 1e-6 * size
+        slopes = central_differences(lambda f: expected(f[:3] * values, f[3] * A), np.ones(4), 1e-5)
+        assert np.max(np.abs(result.by_parameter[0] * values - slopes[:3].T)) < 1e-6 * size
+        assert np.max(np.abs(result.by_amplitude[0] * A - slopes[3])) < 1e-6 * size
 
 
 def test_a_short_time_near_rest_is_not_passed_over():
@@ -394,14 +390,12 @@ def test_derivatives_of_settled_motions_are_differences_of_oracles():
         return fixed_point(plant, result.starts[0], result.maps[0], omega, True, harmonics)[1]
 
     size = np.max(np.abs(result.harmonics[0]))
-    for i in (0, 1, 3, 4, 5, 6):
-        step = np.zeros(values.size)
-        step[i] = 1e-4 * values[i]
-        difference = (oracle(values + step, drive) - oracle(values - step, drive)) / 2e-4
-        computed = result.by_parameter[0, :, i] * values[i]
-        assert np.max(np.abs(computed - difference)) < 1e-6 * size
-    difference = (oracle(values, drive * 1.0001) - oracle(values, drive * 0.9999)) / 2e-4
-    assert np.max(np.abs(result.by_amplitude[0] * drive - difference)) < 1e-6 * size
+    slopes = central_differences(  # an exponent of 1 has a law of its own
+        lambda f: oracle(np.insert(f[:6], 2, 1.0) * values, f[6] * drive), np.ones(7), 1e-4
+    )
+    exact = np.delete(result.by_parameter[0] * values, 2, axis=1)
+    assert np.max(np.abs(exact - slopes[:6].T)) < 1e-6 * size
+    assert np.max(np.abs(result.by_amplitude[0] * drive - slopes[6])) < 1e-6 * size
 
 
 def test_derivatives_along_a_history_jump_at_kinks():
@@ -423,10 +417,9 @@ def test_derivatives_along_a_history_jump_at_kinks():
         return history[np.searchsorted(times, samples)]
 
     size = np.max(np.abs(motion.output))
+    slopes = central_differences(lambda f: force(f * values), np.ones(4), 1e-6)
     for i, parameter in enumerate(chosen):
-        step = np.zeros(4)
-        step[parameter] = 1e-6 * values[parameter]
-        difference = (force(values + step) - force(values - step)) / 2e-6
+        difference = slopes[parameter]
         computed = motion.by_parameter[:, i] * values[parameter]
         assert np.max(np.abs(computed - difference)) < 1e-6 * size
 
@@ -513,12 +506,11 @@ def test_derivatives_of_a_motion_that_slips_far(alpha):
     driven = Driven(plant, 2.0 * drive / drive.std(), rate)
     values = np.array([0.5, 2e3, alpha, 0.3, 0.5, 400.0])
     by = driven.motion(np.zeros(3), values, derivatives=True).by_parameter
-    for i in range(values.size):
-        step = np.zeros(values.size)
-        step[i] = 1e-5 * values[i]
-        ends = [driven.motion(np.zeros(3), values + s * step).output for s in (1.0, -1.0)]
-        difference = (ends[0] - ends[1]) / (2.0 * step[i])
-        assert np.linalg.norm(by[:, i] - difference) < 0.02 * np.linalg.norm(difference)
+    slopes = central_differences(
+        lambda moved: driven.motion(np.zeros(3), moved).output, values, 1e-5 * values
+    )
+    for exact, slope in zip(by.T, slopes, strict=True):
+        assert np.linalg.norm(exact - slope) < 0.02 * np.linalg.norm(slope)
 
 
 def test_friction_faster_than_the_sampling():

@@ -162,10 +162,10 @@ def test_a_search_that_is_stuck_ends_within_a_fifth_of_the_standard_error(errors
     ("made", "noise", "most"),
     [
         (lambda: cold.unknown_slips(11), 5e-3, 80),
-        (lambda: cold.decay("lugre", "mass", 3, 300), 1e-3, 72),
-        (lambda: cold.decay("maxwell_slip", "spring", 3, 300), 1e-3, 105),
-        (lambda: cold.decay("backlash", "spring", 2, 300), 1e-3, 40),
-        (lambda: cold.slips(3), 1e-3, 45),
+        (lambda: cold.free_decay("lugre", "mass", 3, 300), 1e-3, 72),
+        (lambda: cold.free_decay("maxwell_slip", "spring", 3, 300), 1e-3, 105),
+        (lambda: cold.free_decay("backlash", "spring", 2, 300), 1e-3, 40),
+        (lambda: cold.maxwell_slip(3), 1e-3, 45),
     ],
 )
 def test_records_are_described_after_few_evaluations(made, noise, most):
@@ -178,7 +178,7 @@ def test_records_are_described_after_few_evaluations(made, noise, most):
 @pytest.mark.filterwarnings("ignore:.*2 parts are fitted")
 @pytest.mark.parametrize(("seed", "most"), [(414, 60), (419, 35)])
 def test_springs_start_with_the_loads_that_a_gap_leaves(seed, most):
-    record, _, model = cold.slips(seed)
+    record, _, model = cold.maxwell_slip(seed)
     best = solve(RecordProblem([with_gap(record, 200, 260)], model))
     assert 2.0 * best.cost / len(record) < 1.5e-6
     assert best.nfev < most

@@ -9,6 +9,7 @@ from dahl_ident.diagnostics import error_model
 from dahl_ident.diagnostics.contributions import NOISE
 from dahl_ident.diagnostics.error_sources import rows_of_tests
 from dahl_ident.diagnostics.held_out import band_factor
+from tests.derivatives import central_differences
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
@@ -133,16 +134,12 @@ class TestLeftOut:
     def test_falls_with_each_variance(self, n):
         """The degrees of freedom come from these derivatives; against differences."""
         errors = self.errors(n)
-        rows, step = np.array([0, 1, 6, 7]), 1e-5
-        found = errors.state.block_falls(rows)
-        for k, variance in enumerate(errors.state.variances.tolist()):
-            blocks = []
-            for sign in (-1.0, 1.0):
-                moved = errors.state.variances.copy()
-                moved[k] = variance * (1.0 + sign * step)
-                blocks.append(errors.state.model.at(moved).block(rows))
-            slope = (blocks[1] - blocks[0]) / (2.0 * step * variance)
-            np.testing.assert_allclose(found[k], -slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())
+        state, rows = errors.state, np.array([0, 1, 6, 7])
+        slopes = central_differences(
+            lambda moved: state.model.at(moved).block(rows), state.variances, 1e-5 * state.variances
+        )
+        for found, slope in zip(state.block_slopes(rows), slopes, strict=True):
+            np.testing.assert_allclose(found, -slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())
 
     def test_without_tests_there_are_none(self):
         errors = error_model(fit(table(n=2), Dahl(alpha=1.0)).optimum)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dahl_ident.elements import Dahl, hysteresis
 from dahl_ident.elements.hysteresis import force_history, transient_decay
+from tests.derivatives import central_differences
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -131,11 +132,9 @@ def test_linear_history_derivatives():
 
     found, by_start, by = hysteresis.linear_history_gradient(x, 0.2, 30.0, 0.05)
     np.testing.assert_allclose(found, force(point), rtol=0.0, atol=1e-14)
-    for i, slope in enumerate((by_start, *by)):
-        h = np.zeros(3)
-        h[i] = 1e-5 * point[i]
-        expected = (force(point + h) - force(point - h)) / (2.0 * h[i])
-        np.testing.assert_allclose(slope, expected, rtol=0.0, atol=1e-8 * np.abs(expected).max())
+    expected = central_differences(force, point, 1e-5 * point)
+    for one, other in zip((by_start, *by), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-8 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("alpha", [0.7, 1.0, 1.5])

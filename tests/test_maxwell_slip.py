@@ -11,6 +11,7 @@ import dahl_ident as di
 from dahl_ident import fit
 from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.errors import DataError, ModelError, ValidationError
+from tests.derivatives import central_differences
 from tests.recovery import assert_near
 from tests.test_generic_friction import Jenkins
 
@@ -29,25 +30,24 @@ def sliders(x, start):
 
 def test_derivatives_are_exact_and_one_sided_at_a_kink():
     A = np.array([0.05, 0.1, 0.2, 0.7, 3.0])
-    values = [np.asarray(v) for v in (*STIFF, *SLIPS)]
+    values = np.array([*STIFF, *SLIPS])
     for k in (1, 3):
-        found = LAW.stiffness_gradient(values, A, np.zeros(()), k)
-        for i in range(6):
-            h = 1e-6 * float(values[i])
-            moved = [LAW.stiffness([*values[:i], values[i] + s * h, *values[i + 1 :]], A,
-                                   np.zeros(()), k) for s in (1.0, 0.0, -1.0)]  # fmt: skip
-            smooth = np.abs(A - SLIPS[i - 3]) > 0.01 if i >= 3 else np.full(5, True)
-            difference = (moved[0] - moved[2]) / (2.0 * h)
-            np.testing.assert_allclose(found.by_parameter[i][smooth], difference[smooth], atol=1e-7)
-            # at A = d: the element still sticks, so a longer d changes nothing
-            upward = (moved[0] - moved[1]) / h
-            np.testing.assert_allclose(found.by_parameter[i], upward, atol=2e-4)
-        h = 1e-7
-        up, down = (LAW.stiffness(values, A * (1.0 + s * h), np.zeros(()), k) for s in (1, -1))
-        smooth = np.abs(A - 0.1) > 0.01
-        np.testing.assert_allclose(
-            (found.by_amplitude * A)[smooth], ((up - down) / (2.0 * h))[smooth], atol=1e-6
-        )
+
+        def stiffness(at, k=k):
+            """Return the stiffness for values, with a factor of A last."""
+            return LAW.stiffness(list(at[:-1]), at[-1] * A, np.zeros(()), k)
+
+        found = LAW.stiffness_gradient(list(values), A, np.zeros(()), k)
+        exact = np.array([*found.by_parameter, found.by_amplitude * A])
+        point = np.append(values, 1.0)
+        slopes = central_differences(stiffness, point, 1e-6 * point)
+        for i, kinks in enumerate([[]] * 3 + [[d] for d in SLIPS] + [SLIPS]):
+            smooth = np.all([np.abs(A - d) > 0.01 for d in kinks], axis=0) & np.full(5, True)
+            np.testing.assert_allclose(exact[i][smooth], slopes[i][smooth], atol=1e-6)
+        # at A = d: the element still sticks, so a longer d changes nothing
+        for i, step in enumerate(1e-6 * np.diag(values)):
+            upward = (stiffness(point + np.append(step, 0.0)) - stiffness(point)) / step.sum()
+            np.testing.assert_allclose(exact[i], upward, atol=2e-4)
 
 
 def test_the_force_over_time_is_that_of_the_sliders():

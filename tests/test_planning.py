@@ -24,6 +24,7 @@ from dahl_ident.planning.design import (
     packed_information,
 )
 from dahl_ident.problem import ProblemBatch, TableProblem
+from tests.derivatives import central_differences
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -90,10 +91,8 @@ class TestContinuousDesign:
         objective = replace(objective, terms=(replace(objective.terms[0], **change),))
         cycles = np.random.default_rng(1).uniform(1.0, 9.0, 6)
         gradient = objective.gradient(objective.at(cycles)[1])
-        for k in range(6):
-            step = np.where(np.arange(6) == k, 1e-5, 0.0)
-            (up, _), (down, _) = objective.at(cycles + step), objective.at(cycles - step)
-            assert gradient[k] == pytest.approx((up - down) / 2e-5, rel=1e-5)
+        slopes = central_differences(lambda moved: objective.at(moved)[0], cycles, 1e-5)
+        assert gradient == pytest.approx(slopes, rel=1e-5)
 
 
 class TestModelError:
@@ -522,17 +521,12 @@ def _exponent_error(plan):
     """Return the standard uncertainty of ln alpha when the plan is fitted with it free."""
     A = np.array([step.level for step in plan.steps])
     std = 0.01 / np.sqrt([step.measured_cycles for step in plan.steps])
-    steps = {"f_max": 1e-4, "sigma": 1e-4, "alpha": 1e-4}
-    at = {"f_max": F_MAX, "sigma": SIGMA, "alpha": 1.0}
-    columns = []
-    for name, h in steps.items():
-        up, down = (
-            np.log(di.Dahl(**{**at, name: at[name] * np.exp(s)}).describing_function(A))
-            for s in (h, -h)
-        )
-        slope = (up - down) / (2.0 * h)
-        columns.append(np.concatenate([slope.real / std, slope.imag / std]))
-    J = np.array(columns).T
+    slopes = central_differences(
+        lambda ln: np.log(di.Dahl(*np.exp(ln)).describing_function(A)),
+        np.log([F_MAX, SIGMA, 1.0]),
+        1e-4,
+    )
+    J = np.hstack([slopes.real / std, slopes.imag / std]).T
     if np.linalg.matrix_rank(J, tol=1e-6 * np.abs(J).max()) < 3:
         return float("inf")
     return float(np.sqrt(np.linalg.inv(J.T @ J)[2, 2]))

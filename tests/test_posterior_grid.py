@@ -15,7 +15,8 @@ from dahl_ident.bayes.priors import JointPrior, ParameterPrior, joint_prior
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.problem import TableProblem
-from tests.bayes_cases import FRICTION, X_C, friction_table, spring_table, with_covariance
+from tests.bayes_cases import friction_table, spring_table, with_covariance
+from tests.friction_tables import FRICTION, X_C
 
 TIGHT = with_covariance(friction_table(30, 0.1, 10.0, 0.01), 0.01)  # f_max to 0.3 %
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])

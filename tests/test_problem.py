@@ -27,6 +27,7 @@ from dahl_ident import (
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.problem import ProblemBatch, RecordProblem, TableProblem
+from tests.derivatives import central_differences
 
 n = 6
 A = np.geomspace(3e-4, 3e-2, n)
@@ -227,12 +228,9 @@ def test_with_a_free_exponent_and_two_friction_elements():
         "mass": 0.1, "damping": 0.05,
     }  # fmt: skip
     theta = problem.to_search([values[name] for name in problem.names])
-    ours = problem.prediction_jacobian(theta)
-    for i in range(theta.size):
-        step = np.zeros(theta.size)
-        step[i] = 1e-5
-        numerical = (problem.predict(theta + step) - problem.predict(theta - step)) / 2e-5
-        np.testing.assert_allclose(ours[:, i], numerical, atol=1e-7 * np.abs(numerical).max())
+    slopes = central_differences(problem.predict, theta, 1e-5)
+    for ours, slope in zip(problem.prediction_jacobian(theta).T, slopes, strict=True):
+        np.testing.assert_allclose(ours, slope, atol=1e-7 * np.abs(slope).max())
 
 
 def test_by_level():
@@ -252,8 +250,8 @@ def test_by_level():
         return TableProblem(table, model, noise="absolute", steady="describing function")
 
     theta = at(1.0).to_search([0.1, 30.0, 0.3, 0.24])
-    change = at(np.exp(1e-5)).predict(theta) - at(np.exp(-1e-5)).predict(theta)
-    np.testing.assert_allclose(at(1.0).level_slope(theta), change / 2e-5, rtol=1e-6)
+    (slope,) = central_differences(lambda ln: at(np.exp(ln[0])).predict(theta), [0.0], 1e-5)
+    np.testing.assert_allclose(at(1.0).level_slope(theta), slope, rtol=1e-6)
 
 
 @pytest.mark.parametrize("controlled", ["displacement", "force"])

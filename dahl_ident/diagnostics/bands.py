@@ -167,7 +167,7 @@ def departures(
     others = [k for k, source in enumerate(errors.sources) if source.name != MODEL_ERROR]
     state, noises = errors.state, errors.state.model.noises
     # residuals fall as a prediction rises
-    joint = state.model.elsewhere(estimate.y, -estimate.jacobian, others, columns @ directions)
+    joint = state.model.with_residuals(estimate.y, -estimate.jacobian, others, columns @ directions)
     sizes = [*state.variances[[*range(noises), *(noises + k for k in others)]], 1.0]
     K, Q, W = joint.at(np.array(sizes)).K, len(errors.names), directions.shape[1]
     kept = [*range(Q), *range(len(K) - W, len(K))]

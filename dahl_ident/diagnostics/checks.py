@@ -2,7 +2,7 @@
 
 Determined: every parameter, or which combinations. Described: size and kind of the misfit. Assumed:
 what the result depends on and the data cannot test. A check uses quantities that fits of tables and
-of records both have, or is marked as one for tables or records only.
+of records both have, unless it is marked as a check of tables or of records only.
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.noise import squares_of
 from dahl_ident.units import si_unit
 
-_TOO_LARGE = 0.5  # rms misfit: the model does not describe half of the response
-_FAIRLY = 0.2  # rms misfit in excess of noise, above which intervals do not hold
-_OF_WRONG_LAW = 0.05  # the same where another law has a far smaller misfit
-_SLOW_SAMPLES = 0.3  # effective share of the samples, below which noise looks like a wrong law,
-_VISIBLE = 0.05  # if its rms is more than this share of the output
-_FEW = 10.0  # degrees of freedom: an uncertainty is then known to 20 %
+_LARGEST_RMS = 0.5  # misfit above which the model does not describe half of the response
+_LARGEST_RMS_BEYOND_NOISE = 0.2  # the same if the misfit exceeds noise: intervals do not hold
+_LARGEST_RMS_OF_WRONG_LAW = 0.05  # the same if another law has a far smaller misfit
+_SLOW = 0.3  # effective share of the samples below which a misfit may look like slow noise
+_VISIBLE = 0.05  # rms of such a misfit, as a share of the output, from which it is reported
+_FEW_DOF = 10.0  # degrees of freedom: an uncertainty is then known to 20 %
 _FEW_RUNS, _WIDE = 3.0, 4.0  # degrees of freedom of few runs; k twice that of many
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _ENOUGH_HELD_OUT = 16  # held-out values: with 16, fewer than 80 % in 95 % bands is a 1 % chance
-_DOUBTS_SHOWN = 5  # warnings shown; more would hide the verdict
-_CHANCE = 0.0027  # probability that data contradict a correct constraint as much
+_MOST_WARNINGS = 5  # warnings shown; more would hide the verdict
+_CONTRADICTION = 0.0027  # p-value up to which the data contradict a constraint
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
-_PASSES, _SETTLED = 100, 1e-3  # most iterations of a robust fit; tolerance in uncertainties
+_ITERATIONS, _SETTLED = 100, 1e-3  # most of a robust fit; its tolerance in uncertainties
 
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 Assessed = TableAssessment | RecordAssessment
 _Check = Callable[[Any], Iterable[Finding]]
 
 
-def _of(kind: str, check: _Check) -> _Check:
+def _limited(kind: str, check: _Check) -> _Check:
     """Return a check that applies to fits of one kind of data only."""
 
     @wraps(check)
@@ -76,15 +76,15 @@ def _of(kind: str, check: _Check) -> _Check:
     return limited
 
 
-_of_tables, _of_records = partial(_of, "table"), partial(_of, "records")
+_of_tables, _of_records = partial(_limited, "table"), partial(_limited, "records")
 
 
 def judgement(fit: Assessed) -> Judgement:
     """Return the findings of every check, and the status that follows from them.
 
     Misfit findings of the reduced fit replace those of the fit where they are worse: harmonics or
-    a stated covariance may otherwise hide a misfit of the fundamentals. Residuals with constraints
-    that the data contradict are not noise, even where no other test shows it.
+    a stated covariance may otherwise hide a misfit of the fundamentals. If the data contradict a
+    constraint, the residuals are not noise, even if no other test shows it.
     """
     findings = [finding for check in CHECKS for finding in check(fit)]
     if any(finding.code == "constraint" for finding in findings):
@@ -110,12 +110,12 @@ def _parameters(fit: Assessed) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
     if fit.goodness.sign:
         return  # with the wrong sign, parameters have no meaning
-    optimum, known = fit.optimum, fit.identifiability
+    optimum, identified = fit.optimum, fit.identifiability
     noise_known = optimum.scale_known or optimum.dof > 0
-    if noise_known or known.complete:
-        yield known.finding
-    if noise_known and not known.complete and known.combinations:
-        yield determined("combinations", combinations=tuple(map(str, known.combinations)))
+    if noise_known or identified.complete:
+        yield identified.finding
+    if noise_known and not identified.complete and identified.combinations:
+        yield determined("combinations", combinations=tuple(map(str, identified.combinations)))
     if not fit.success:
         message = optimum.status.value if optimum.status.at_infinity else optimum.message
         yield determined("solver", message=message)
@@ -127,8 +127,8 @@ def _parameters(fit: Assessed) -> Iterator[Finding]:
             scale_known=optimum.scale_known,
         )
     if noise_known:
-        for why in dict.fromkeys(parameter.why for parameter in known.open):
-            shown = {p.name: p.known_text for p in known.open if p.why == why}
+        for why in dict.fromkeys(parameter.why for parameter in identified.open):
+            shown = {p.name: p.known_text for p in identified.open if p.why == why}
             yield determined("undetermined_parameters", shown=shown, why=why)
 
 
@@ -146,22 +146,23 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
         yield described("sign", _NOT_DESCRIBED, convention=fit.goodness.sign)
         return
     problem, converged = fit.problem, fit.optimum.converged
-    far = fit.goodness.rms_in_band > (_FAIRLY if fit.exceeds_noise else _TOO_LARGE)
-    if far:
+    limit = _LARGEST_RMS_BEYOND_NOISE if fit.exceeds_noise else _LARGEST_RMS
+    too_large = fit.goodness.rms_in_band > limit
+    if too_large:
         yield described("records_not_described", _NOT_DESCRIBED, rms=fit.goodness.rms_in_band)
     displaced = all(record.displacement is not None for record in problem.records)
-    if problem.output == "motion" and (far or not converged) and displaced:
+    if problem.output == "motion" and (too_large or not converged) and displaced:
         yield described("motion_may_be_imposed", _NOT_DESCRIBED)
-    if fit.exceeds_noise and not far:
+    if fit.exceeds_noise and not too_large:
         follows = fit.errors.misfit.follows if fit.errors.misfit else ""
         kind, remedy = REMEDY.get(follows, ("", ""))
         if kind and all(element.kind != kind for element in problem.model.elements):
             remedy = f"add a {kind}, or {remedy}"
         yield described("records_misfit", _APPROXIMATE, follows=follows, remedy=remedy)
     effective = fit.errors.effective / problem.n_samples
-    if not fit.exceeds_noise and effective < _SLOW_SAMPLES and fit.goodness.rms_in_band > _VISIBLE:
+    if not fit.exceeds_noise and effective < _SLOW and fit.goodness.rms_in_band > _VISIBLE:
         yield described("slow_misfit", _APPROXIMATE, rms=fit.goodness.rms_in_band)
-    if fit.errors.dof_of(NOISE) < _FEW:
+    if fit.errors.dof_of(NOISE) < _FEW_DOF:
         few = {"effective": fit.errors.effective, "unknowns": len(problem.names)}
         yield described("few_effective_samples", _APPROXIMATE, **few)
     yield from _reservations(fit)
@@ -181,9 +182,10 @@ def _misfit_of_table(fit: TableAssessment) -> Iterator[Finding]:
         or goodness.is_of_several_devices
         or any(finding.severity is _NOT_DESCRIBED for finding in bands)
     )
-    limit = _TOO_LARGE
+    limit = _LARGEST_RMS
     if goodness.objections:
-        limit = _OF_WRONG_LAW if goodness.law_is_wrong else _FAIRLY
+        wrong = goodness.law_is_wrong
+        limit = _LARGEST_RMS_OF_WRONG_LAW if wrong else _LARGEST_RMS_BEYOND_NOISE
     large = goodness.rms_misfit > limit
     severity = _NOT_DESCRIBED if unusable or large else _APPROXIMATE
     yield from goodness.findings(severity, counted=severity is _APPROXIMATE and fit.is_determined)
@@ -203,7 +205,7 @@ def _stated_exponent_is_wrong(fit: TableAssessment) -> bool:
 
 
 def _bands(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield whether the bands hold for what was held out."""
+    """Yield whether the bands hold for values that were held out."""
     check = fit.cross_validation
     if check is None:
         return
@@ -221,9 +223,9 @@ def _bands(fit: TableAssessment) -> Iterator[Finding]:
 def _misfit_within_runs(errors: ErrorModel) -> float:
     """Return the misfit that bands have to cover.
 
-    Differences between runs are not counted: the other rows of its run predict a row that is held
-    out. A force in parallel with the model and a change with speed are not counted, as bands are
-    centred on them. A smooth departure from the law is counted.
+    It includes a smooth departure from the law. It does not include differences between runs,
+    because a held-out row is predicted from the other rows of its run, nor a force in parallel with
+    the model or a change with speed, on which bands are centred.
     """
     fitted = (errors.within_runs, errors.parallel_to_the_law)
     return min(rms_misfit_of(errors.problem, responses) for responses in fitted)
@@ -231,11 +233,11 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
 
 @_of_tables
 def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield where a force exceeds what friction can carry, except in rows that stand apart."""
+    """Yield where a force exceeds the limit of friction, except in rows that stand apart."""
     errors, scatter = fit.errors, sum(fit.goodness.runs_scatter.values())
     optimum = fit.optimum if errors is None else errors.at_estimate
-    named = optimum.loss != "linear" or fit.goodness.apart  # as what contradicts the model
-    outliers = [p.row for p in fit.goodness.suspicious] if named else []
+    excused = optimum.loss != "linear" or fit.goodness.apart  # outliers are reported as such
+    outliers = [p.row for p in fit.goodness.suspicious] if excused else []
     yield from beyond_friction_limit(optimum, scatter, outliers)
 
 
@@ -258,7 +260,7 @@ def _weak_elements(fit: Assessed) -> Iterator[Finding]:
 def _constraints(fit: Assessed) -> Iterator[Finding]:
     """Yield the constraints if the data contradict them."""
     cost = fit.constraint_cost
-    if cost is not None and cost.p_value <= _CHANCE:
+    if cost is not None and cost.p_value <= _CONTRADICTION:
         known = {"noise_known": bool(np.isinf(cost.dof)), "p_value": cost.p_value}
         yield described(
             "constraint", _NOT_DESCRIBED, texts=tuple(cost.texts), rise=cost.rise, **known
@@ -289,7 +291,7 @@ def _exponents(fit: Assessed) -> Iterator[Finding]:
 
 @_of_tables
 def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield which parameters a robust fit moves by more than one uncertainty from noise."""
+    """Yield the parameters that a robust fit moves by more than their uncertainty from noise."""
     if fit.optimum.loss != "linear" or fit.errors is None:
         return
     at = fit.by_noise
@@ -303,13 +305,13 @@ def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
 def robust_values(at: Optimum) -> FloatArray:
     """Return the values (P,) of a robust fit to the model linearised at an estimate.
 
-    The noise's scale, where it is not stated, is the robust one of
+    The scale of the noise, where it is not stated, is the robust one of
     :mod:`dahl_ident.fitting.losses`.
     """
     problem, loss, scale = at.problem, LOSSES["huber"], at.scale
     (y, J), m = problem.residuals_and_jacobian(at.theta), problem.n_residuals
     move: FloatArray = np.zeros(len(at.theta))
-    for _ in range(_PASSES):
+    for _ in range(_ITERATIONS):
         if not problem.scale_known:
             square = squares_of((y + J @ move)[:m] / scale)
             scale *= loss.rescaled(square, m - len(move)) ** 0.5
@@ -324,7 +326,7 @@ def robust_values(at: Optimum) -> FloatArray:
 
 @_of_records
 def _delay(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield the delay that was removed; it is doubtful if its effect exceeds the noise."""
+    """Yield the delay that was removed; it is doubtful if its effect exceeds the residuals."""
     problem = fit.problem
     if not problem.delay:
         return
@@ -337,7 +339,7 @@ def _delay(fit: RecordAssessment) -> Iterator[Finding]:
 
 @_of_records
 def _clipped(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield the channels of which some samples are clipped."""
+    """Yield the channels with clipped samples."""
     shares = dict[str, float]()
     for record in fit.problem.records:
         force = "drive" if record.force is None else "force"
@@ -381,9 +383,9 @@ def _treatment_of_noise(fit: RecordAssessment) -> Iterator[Finding]:
 def reading(fit: Any) -> Iterator[Finding]:
     """Yield the warnings on reading the data of a fit or posterior."""
     texts = list(dict.fromkeys(text for p in fit.problem.provenances for text in warnings_in(p)))
-    yield from (described("warning", text=text) for text in texts[:_DOUBTS_SHOWN])
-    if len(texts) > _DOUBTS_SHOWN:
-        yield described("more_warnings", count=len(texts) - _DOUBTS_SHOWN)
+    yield from (described("warning", text=text) for text in texts[:_MOST_WARNINGS])
+    if len(texts) > _MOST_WARNINGS:
+        yield described("more_warnings", count=len(texts) - _MOST_WARNINGS)
 
 
 def _few_runs(fit: Assessed) -> Iterator[Finding]:
@@ -401,9 +403,10 @@ def _few_runs(fit: Assessed) -> Iterator[Finding]:
 def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
     """Yield one finding with the assumptions that the data of a fit cannot test.
 
-    Those of noise alone, unless all sources of error are `counted`.
+    If only noise is `counted`, other sources of error are among the assumptions.
     """
-    counted, (estimates, stderr) = counted and fit.counts_sources, fit.known
+    counted = counted and fit.counts_sources
+    estimates, stderr = fit.known
     ranges, stated = [], dict[str, float]()
     for p in fit.problem.model.parameters:
         if p.prior is None or p.free:

@@ -288,7 +288,7 @@ class ErrorModel(ErrorContributions):
             return 1.0
         model = self.state.model
         shared = [k for k, source in enumerate(self.sources) if source.per_test]
-        null = model.only(shared)
+        null = model.with_sources(shared)
         variances = np.zeros(model.count)
         kept = [*range(model.noises), *(model.noises + k for k in shared)]
         variances[kept] = null.reml(np.ones(len(shared))).variances
@@ -356,7 +356,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     noises = state.model.noises
     shown = np.flatnonzero(state.variances[noises:] > 0.0)
     sources = tuple(sources[k] for k in shown)
-    state = state.model.only(shown).at(state.variances[[*range(noises), *(noises + shown)]])
+    state = state.model.with_sources(shown).at(state.variances[[*range(noises), *(noises + shown)]])
     exponents = set[str]()
     if estimate.regular:
         exponents = {name for name, p in assumed.items() if p.source == EXPONENT}

@@ -6,16 +6,18 @@ covariance were
     C + s^2 |F_1|^2.
 
 The misfit s is the same for all fundamentals, and such that chi-square equals its degrees of
-freedom: zero where the model describes the data. The misfit of harmonics is that value or the one
-from their own residuals, whichever is larger. In addition, their weight is reduced as far as their
-estimate disagrees with that of the fundamentals. Where no covariance is stated, the estimated scale
-of the noise is used instead of s.
+freedom: zero where the model describes the data (Paule and Mandel, Journal of Research of the
+National Bureau of Standards 87 (1982) 377). The misfit of harmonics is that value or the one from
+their own residuals, whichever is larger. If the harmonics alone give another estimate than the
+fundamentals, their variance is increased until both agree. Where no covariance is stated, the
+estimated scale of the noise replaces s.
+
 With a robust loss the residuals are its scores, and chi-square and scale are those of
 :mod:`dahl_ident.fitting.losses`; everything else is as in least squares, to first order.
-Priors of sensors and ranges of assumed exponents are further rows. Where the optimum lies at
+
+Priors of sensors and ranges of assumed exponents are additional rows. If the optimum lies at
 infinity, the coordinates are those of its limit (:mod:`dahl_ident.fitting.asymptotes`), such as
-sigma^2/f_max in microslip. Source: Paule and Mandel,
-Journal of Research of the National Bureau of Standards 87 (1982) 377.
+sigma^2/f_max in microslip.
 """
 
 from __future__ import annotations
@@ -44,37 +46,37 @@ from dahl_ident.problem.stiffness import StiffnessData
 
 GAIN = "force_gain"
 _GAUSS_NEWTON_STEPS = 60  # most Gauss-Newton steps; five are usual
-_NO_BETTER = 0.25  # variance of an exponent over that of its range: there may be two minima
-_TWO_MINIMA = 0.1  # distance of two different minima, in standard deviations
-_NEAR_ENOUGH = 0.03  # last step of an estimate of a jackknife, in standard deviations
+_BARELY_DETERMINED = 0.25  # variance of an exponent over that of its range: two minima are possible
+_TWO_MINIMA = 0.1  # least distance of different minima, in standard deviations
+_JACKKNIFE_SETTLED = 0.03  # last step of an estimate of the jackknife, in standard deviations
 _LINEAR = 0.3  # change of a logarithm up to which the model is linear
 _SETTLED = 1e-3  # last step of a search, in standard deviations
 _LONGEST_STEP = 0.7  # change of a logarithm in one step of the linearised model
 _FIRST_DAMPING, _DAMPED = 1e-3, 10.0  # damping after a step that fails, and its factor
 _STEP_TRIALS = 8  # trials of one step, each with more damping
 _ROOT_STEPS = 200  # most Newton steps for the misfit; far from the root, it doubles
-_LEAST_LEFT = 1e-3  # least part of a test's residuals that is left at high leverage
-_MOST_DISAGREEMENT = 1e6  # largest factor of the harmonics' variance
+_LEAST_REMAINING = 1e-3  # least value of 1 - leverage of a test
+_LARGEST_FACTOR = 1e6  # of the harmonics' variance
 _SAME_FACTOR = 1e-8  # tolerance of the logarithm of that factor
 _SAME_MISFIT = 1e-9  # relative tolerance of the misfit's square
 
 
 def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart:
-    """Return the coordinates of the limit at which an optimum lies; theta where it is finite.
+    """Return the coordinates of the limit at which an optimum lies; theta if it is finite.
 
-    `problem` may have more free parameters, coordinates in addition to those of the limit.
+    Free parameters of `problem` that the optimum does not have are added as coordinates.
     """
     extremes = {
         p.name: value
         for p, value in zip(optimum.problem.parameters, optimum.values.tolist(), strict=True)
         if np.isinf(value) or (value == 0.0 and p.positive)
     }
-    every = limits(optimum.problem) if extremes else ()
-    reached = [limit for limit in every if limit.extremes == extremes]
-    if not reached:
+    candidates = limits(optimum.problem) if extremes else ()
+    matching = [limit for limit in candidates if limit.extremes == extremes]
+    if not matching:
         return Basis.every(len(problem.names)).chart
     chart = min(
-        (limit.chart.of(0) for limit in reached),
+        (limit.chart.of(0) for limit in matching),
         key=lambda c: float(np.abs(c.theta(c.phi(optimum.theta)) - optimum.theta).max()),
     )
     of_optimum = [problem.names.index(name) for name in optimum.names]
@@ -87,14 +89,14 @@ def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart:
 
 
 class Assumption(NamedTuple):
-    """Uncertainty of a parameter held at a value: its source in a budget, and that of its log."""
+    """Uncertainty of a parameter that a fit assumes: its name in a budget, and its size."""
 
     source: str
-    std: float
+    std: float  # standard uncertainty of the logarithm
 
 
 def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumption]]:
-    """Return the problem with assumed exponents and an uncertain drive factor free."""
+    """Return the problem with free assumed exponents and drive factor, and their uncertainties."""
     assumed = {
         p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
         for p in problem.model.parameters
@@ -113,16 +115,16 @@ def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumpt
 class WeightedEstimate:
     """Weighted least squares: the optimum of a problem whose covariances hold the misfit."""
 
-    problem: TableProblem  # the assumed exponents free, its covariances with the misfit
+    problem: TableProblem  # with assumed exponents free, and the misfit in the covariances
     theta: FloatArray  # (Q,): the estimate, search coordinates
-    misfit_variance: FloatArray  # (n,): added to the stated covariances by the misfit
+    misfit_variance: FloatArray  # (n,): what the misfit adds to the stated covariances
     scale: float  # of the residuals; 1 where the data state it
-    residuals: FloatArray  # (M,): those of data, then of priors, of unit variance
+    residuals: FloatArray  # (M,): of unit variance; those of data, then of priors
     jacobian: FloatArray  # (M, Q): their derivatives
     loss: Loss | None
     regular: bool  # whether the data determine every parameter
-    basis: Basis  # directions that they determine
-    # (Q,): distance to a second minimum times the root of its probability; None without one
+    basis: Basis  # directions that the data determine
+    # (Q,): difference to a second minimum times the root of its probability; None without one
     second: FloatArray | None = None
 
     @cached_property
@@ -136,7 +138,7 @@ class WeightedEstimate:
 
     @cached_property
     def chance(self) -> float:
-        """Probability that the stated noise alone makes chi-square as large; 1 without misfit."""
+        """Probability that the stated noise alone makes chi-square this large; 1 without misfit."""
         if not self.problem.has_misfit:
             return 1.0
         r = self.problem.widened(np.zeros(self.problem.data.n)).residuals(self.theta)
@@ -180,7 +182,7 @@ class WeightedEstimate:
         return relative_units(self.problem, self.theta, self.predicted) * self.scale
 
     def lever(self, left_out: Collection[str] = ()) -> FloatArray:
-        """Return G = (J'J)^-1 J', d theta/d y (Q, M); the parameters `left_out` are exact."""
+        """Return G = (J'J)^-1 J', d theta/d y (Q, M), for exact values of `left_out`."""
         kept = self.basis.matrix
         if left_out:
             kept = kept[:, [name not in left_out for name in self.problem.names]]
@@ -201,8 +203,8 @@ class WeightedEstimate:
     def jackknife(self, tests: Sequence[IntArray]) -> FloatArray:
         """Return the covariance of theta by leaving out each test, (Q, Q), to first order.
 
-        The change by each test is weighted with the root of its leverage, so that the covariance
-        is unbiased where the weights are right. Source: Wu, Annals of Statistics 14 (1986) 1261.
+        The change due to each test is divided by the root of 1 - leverage, so that the covariance
+        is unbiased if the weights are right. Source: Wu, Annals of Statistics 14 (1986) 1261.
         """
         Q, R = np.linalg.qr(self.jacobian)
         moves = []
@@ -210,7 +212,7 @@ class WeightedEstimate:
             of_test = (2 * rows[:, None] + np.arange(2)).ravel()
             remaining, vectors = np.linalg.eigh(np.eye(len(R)) - Q[of_test].T @ Q[of_test])
             scores = vectors.T @ (Q[of_test].T @ self.y[of_test])
-            moves.append(vectors @ (scores / np.sqrt(np.maximum(remaining, _LEAST_LEFT))))
+            moves.append(vectors @ (scores / np.sqrt(np.maximum(remaining, _LEAST_REMAINING))))
         changes = np.linalg.solve(R, np.array(moves).T).T
         changes = np.clip(changes, *(bound - self.theta for bound in self.problem.bounds()))
         return np.asarray(changes.T @ changes)
@@ -219,7 +221,7 @@ class WeightedEstimate:
 def row_changes(
     problem: TableProblem, theta: FloatArray, size: FloatArray | ComplexArray
 ) -> FloatArray:
-    """Return the changes of each row's residuals by changes `size` and i `size`, (n, 2, 2)."""
+    """Return the changes of each row's residuals if its response changes by `size` and i `size`."""
     both = problem.residual_change(theta, np.array([[1.0], [1.0j]]) * size)
     return both.reshape(2, -1, 2).transpose(1, 2, 0)
 
@@ -234,8 +236,9 @@ def weighted_estimate(
 ) -> WeightedEstimate:
     """Return the estimate, searched from an optimum.
 
-    Where the data determine an assumed exponent little better than its range does, there may be a
-    second minimum: the search also starts at the ends of the range, and the likelier one is taken.
+    If the data determine an assumed exponent barely better than its range does, there may be a
+    second minimum. The search is then repeated from the ends of the range, and the likelier minimum
+    is taken.
     """
     best = _minimum(optimum, problem, optimum.theta_in(problem), determined=determined)
     if not determined:
@@ -245,13 +248,13 @@ def weighted_estimate(
     for name, (centre, std) in problem.ranges.items():
         i = problem.names.index(name)
         column, variance = covariance[:, i], float(covariance[i, i])
-        if name == GAIN or not variance > _NO_BETTER * std**2:
+        if name == GAIN or not variance > _BARELY_DETERMINED * std**2:
             continue
         for end in (centre - 3.0**0.5 * std, centre + 3.0**0.5 * std):
             change = column / variance * (end - best.theta[i])
-            begin = np.clip(best.theta + change, *problem.bounds())
-            with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):  # far off
-                minimum = _minimum(optimum, problem, begin, determined=True)
+            start = np.clip(best.theta + change, *problem.bounds())
+            with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):  # a start far off
+                minimum = _minimum(optimum, problem, start, determined=True)
                 minima += [minimum] if np.isfinite(minimum.deviance) else []
     best, *others = sorted(minima, key=lambda minimum: minimum.deviance)
     different = [
@@ -269,9 +272,9 @@ def jackknife_with_weights(
 ) -> FloatArray:
     """Return the covariance of theta, (Q, Q), by estimating it and the weights without each test.
 
-    The model is linearised at the estimate, and refitted where a test moves it far. The changes
-    are not weighted with the leverage, as the weights may be wrong: a test that alone determines a
-    parameter makes it as uncertain as the other tests leave it.
+    The model is linearised at the estimate, and refitted if a test moves the estimate far. The
+    changes are not weighted with the leverage, because the weights may be wrong: a parameter that
+    one test alone determines is as uncertain as it is without that test.
     """
     theta, loss = estimate.theta, estimate.loss
     problem = estimate.problem.widened(np.zeros(estimate.problem.data.n))
@@ -281,14 +284,14 @@ def jackknife_with_weights(
         kept = np.ones(problem.data.n, dtype=bool)
         kept[test] = False
         others, refitted = rows.take(kept), theta.copy()
-        with suppress(np.linalg.LinAlgError):  # the others do not determine it
+        with suppress(np.linalg.LinAlgError):  # the other tests do not determine theta
             for _ in range(_GAUSS_NEWTON_STEPS):
                 at = others.moved(refitted - theta)
                 r, columns = at.weighted(at.squares(loss))
                 y = scores_of(r, 2 * len(at.z), loss)
                 step = _step(columns, y, refitted, basis, bounds)
                 refitted = refitted + step
-                if np.linalg.norm(columns @ step) < _NEAR_ENOUGH:
+                if np.linalg.norm(columns @ step) < _JACKKNIFE_SETTLED:
                     break
             if np.abs(refitted - theta)[problem.space.positive].max(initial=0.0) > _LINEAR:
                 part = problem.part(kept, problem.data.response[kept])
@@ -302,7 +305,7 @@ def jackknife_with_weights(
 class LinearRows:
     """Rows whitened by the stated covariances, rotated so that their two parts are independent.
 
-    A squared misfit x makes the variances of the two parts 1 + growth x.
+    With a squared misfit x, the variances of the two parts are 1 + growth x.
     """
 
     z: FloatArray  # (n, 2)
@@ -339,14 +342,14 @@ class LinearRows:
         return replace(self, z=self.z + self.slopes @ step, priors=(y + J @ step, J))
 
     def weighted(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return residuals of unit variance, and derivatives, for misfits of the squares (n,)."""
+        """Return residuals of unit variance and their derivatives, for squared misfits (n,)."""
         weight = 1.0 / np.sqrt(1.0 + self.growth * square[:, None])
         y, J = self.priors
         slopes = (weight[:, :, None] * self.slopes).reshape(-1, J.shape[1])
         return np.concatenate([(weight * self.z).ravel(), y]), np.concatenate([slopes, J])
 
     def squares(self, loss: Loss | None) -> FloatArray:
-        """Return each row's squared misfit, (n,), with which chi-square has its expected value."""
+        """Return each row's squared misfit, (n,), such that chi-square has its expected value."""
         y, J = self.priors
         first, square = self.first, np.zeros(len(self.z))
         separate = bool(first.any() and not first.all() and 2 * first.sum() > J.shape[1])
@@ -368,7 +371,7 @@ class LinearRows:
 def _minimum(
     optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
 ) -> WeightedEstimate:
-    """Return the minimum at which a search from theta ends."""
+    """Return the minimum that a search from theta finds."""
     stated, basis = problem.widened(np.zeros(problem.data.n)), Basis.every(len(theta))
     loss, m = loss_named(optimum.loss, problem.residuals_per_row), problem.n_residuals
     if not determined:
@@ -414,12 +417,12 @@ def _minimum(
 
 
 def scores_of(r: FloatArray, m: int, loss: Loss | None) -> FloatArray:
-    """Return the residuals of least squares: scores of a robust loss for the first m, of data."""
+    """Return residuals for least squares: with a robust loss, scores of the data's m residuals."""
     return r if loss is None else np.concatenate([loss.scores(r[:m]), r[m:]])
 
 
 def _cost(r: FloatArray, m: int, loss: Loss | None, mean: float) -> float:
-    """Return the sum of squares, or of losses over their mean slope, which has those scores."""
+    """Return the sum of squares; with a loss, the function whose gradient the scores give."""
     z = squares_of(r[:m])
     return float(np.sum(z if loss is None else loss.rho(z) / mean) + r[m:] @ r[m:])
 
@@ -431,7 +434,7 @@ def _step(
     basis: Basis,
     bounds: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Return the Gauss-Newton step; parameters that it would move out of bounds go to the bound."""
+    """Return the Gauss-Newton step; parameters that would leave their bounds end at them."""
     to_bounds, inside = np.zeros(columns.shape[1]), np.ones(columns.shape[1], dtype=bool)
     matrix = basis.matrix
     uncoupled = (matrix != 0.0).sum(axis=1) == 1
@@ -451,12 +454,12 @@ def _step(
 
 
 def _extrapolation(moved: FloatArray, last: FloatArray | None) -> float:
-    """Return the factor of a step that continues a geometric series, to reach its sum at once."""
+    """Return the factor that takes a step of a geometric series to the limit of the series."""
     ratio = 0.0 if last is None else float(moved @ last) / max(float(last @ last), TINY)
     return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
 
 
-@lru_cache(maxsize=64)  # asked for at every step of a search
+@lru_cache(maxsize=64)  # used in every step of a search
 def tests_of(data: FrequencyResponse) -> tuple[IntArray, IntArray]:
     """Return the number of each row's test, and the row of its fundamental, (n,) each.
 
@@ -486,7 +489,7 @@ def _weights(
         square = LinearRows.at(stated, theta).squares(loss)
         return square * fundamental_sizes(stated.data) ** 2, 1.0
     m, dof = stated.n_residuals, stated.n_nonzero - len(stated.names)
-    # with the derivatives, which the weighted ones will need
+    # derivatives are computed too, as they are needed next
     y = stated.residuals_and_jacobian(theta, tails=loss is None)[0]
     scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(stated.rounding), 1e-300)
     scale = agreed_scale(stated, loss, lambda _: (theta, dof), scale)
@@ -496,8 +499,8 @@ def _weights(
 def _disagreement(y: FloatArray, J: FloatArray, harmonics: BoolArray) -> float:
     """Return the factor of the harmonics' variance with which they agree with the fundamentals.
 
-    Both are estimates of the parameters, and the factor is that of Paule and Mandel: the square of
-    their distance, over its variance, is the number of directions that harmonics determine.
+    Both estimate the parameters. As in Paule and Mandel's method, the squared distance of the two
+    estimates over its variance equals the number of directions that the harmonics determine.
     """
     of_harmonics = np.pad(np.repeat(harmonics, 2), (0, len(y) - 2 * len(harmonics)))
 
@@ -521,11 +524,11 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: BoolArray) -> float:
     def excess(ln_factor: float) -> float:
         return distance(np.exp(ln_factor)) - directions
 
-    most = np.log(_MOST_DISAGREEMENT)
+    most = np.log(_LARGEST_FACTOR)
     if excess(0.0) <= 0.0:
         return 1.0
     if excess(most) >= 0.0:
-        return _MOST_DISAGREEMENT
+        return _LARGEST_FACTOR
     from scipy.optimize import brentq  # slow to import, and rarely needed
 
     return float(np.exp(brentq(excess, 0.0, most, xtol=_SAME_FACTOR)))

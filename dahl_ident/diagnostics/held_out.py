@@ -125,12 +125,12 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
         index = (2 * rows[:, None] + np.arange(2)).ravel()
         refit = estimate.without(index)
         try:
-            others = state.model.elsewhere(refit.y, refit.columns).at(state.variances)
+            others = state.model.with_residuals(refit.y, refit.columns).at(state.variances)
             D = np.linalg.inv(others.block(index))
         except np.linalg.LinAlgError:
             continue
         to_gain_and_phase, r = estimate.relative_units[rows], np.arange(len(rows))
-        blocks = np.concatenate([D[None], D @ others.block_falls(index) @ D]).reshape(
+        blocks = np.concatenate([D[None], D @ others.block_slopes(index) @ D]).reshape(
             -1, len(r), 2, len(r), 2
         )
         by_source = np.einsum(

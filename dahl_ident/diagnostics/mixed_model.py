@@ -1,15 +1,15 @@
 r"""Linear mixed models: variances of several sources of error, and what follows from them.
 
-Residuals y = J delta + sum_k Z_k u_k + e: parameters delta, independent numbers u_k of the variance
-s_k for each source, and noise e of known and estimated variance in each group of rows. The
-variances maximise the restricted likelihood (REML). All that it needs follows from Henderson's
-equations,
+The residuals are y = J delta + sum_k Z_k u_k + e, with parameters delta, independent numbers u_k of
+variance s_k for each source k, and noise e whose variance in each group of rows is the sum of a
+known and an estimated part. The variances maximise the restricted likelihood (REML), which follows
+from Henderson's equations,
 
     K = (U' D^-1 U + diag(0, 1/s))^-1,    U = [J Z],    P = D^-1 - D^-1 U K U' D^-1,
 
-D the variance of e: K is the covariance of the errors of delta by generalised least squares and of
-the predicted u. U enters by its cross-products in each group, so many rows cost as much as few.
-With V_k = Z_k Z_k',
+with D the variance of e. K is the covariance of the errors of delta by generalised least squares
+and of the predicted u. Only the cross-products of U in each group are needed, so the cost does not
+grow with the number of rows. With V_k = Z_k Z_k',
 
     gradient_k = (y'P V_k P y - tr P V_k)/2,    information_kl = tr(P V_k P V_l)/2,
 
@@ -28,17 +28,22 @@ from scipy import linalg, special
 from dahl_ident.arrays import TINY, BoolArray, FloatArray, IntArray
 
 _SCORING_STEPS = 40  # at most; the likelihood rises in each, so the last is the best
-_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
+_STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # shares of a scoring step, until the likelihood rises
 _LIKELIHOOD_SETTLED = 1e-3  # rise of the log-likelihood that no longer matters
 _LEAST_NOISE = 1e-6  # of the mean square of the residuals: less is lost in rounding
-_UNSEEN = 1e-100  # root of the information on a variance of which nothing is known
-_DRAWS = 5000  # of noise alone: a level of 1 % over ten tests is known to a half
-_RATIOS = (0.1, 1e4, 21)  # of a source's largest variance over the noise's, from, to and count
-_RIDGE = 1e-9  # added to correlations of one: sources that do the same share a variance
+_UNSEEN = 1e-100  # root of the information on a variance about which nothing is known
+_DRAWS = 5000  # of noise alone: a level of 1 % over ten tests is known to within a half
+_RATIOS = (0.1, 1e4, 21)  # largest variance of a source over the noise: from, to, number
+_RIDGE = 1e-9  # least eigenvalue of correlations: sources with the same effect share a variance
 
 
 class MixedModel:
-    """Residuals, and the columns of parameters and sources."""
+    """Residuals y, and the columns of parameters (J) and of sources (Z).
+
+    `group` is the group of each row, and `known` the known variance of each group. The noise of the
+    first `groups` groups has an estimated part as well. `most` are the largest variances of the
+    sources.
+    """
 
     def __init__(
         self,
@@ -67,18 +72,18 @@ class MixedModel:
         return self.noises + len(self.starts)
 
     def columns(self, k: int) -> slice:
-        """Return the columns of U that are source k's."""
+        """Return the columns of source k in U."""
         ends = [*self.starts.tolist(), self.U.shape[1]]
         return slice(ends[k], ends[k + 1])
 
-    def only(self, kept: Iterable[int]) -> MixedModel:
+    def with_sources(self, kept: Iterable[int]) -> MixedModel:
         """Return the model with some of its sources."""
-        return self.elsewhere(self.y, self.U[:, : self.parameters], kept)
+        return self.with_residuals(self.y, self.U[:, : self.parameters], kept)
 
-    def elsewhere(
+    def with_residuals(
         self, y: FloatArray, J: FloatArray, kept: Iterable[int] | None = None, *more: FloatArray
     ) -> MixedModel:
-        """Return sources, or some of them and `more`, with other residuals and derivatives."""
+        """Return the model of other residuals and derivatives, with sources `kept` and `more`."""
         chosen = list(range(len(self.starts)) if kept is None else kept)
         Z = [*(self.U[:, self.columns(k)] for k in chosen), *more]
         most = np.append(self.most[self.noises :][chosen], np.full(len(more), np.inf))
@@ -89,7 +94,11 @@ class MixedModel:
         return MixedState(self, variances)
 
     def reml(self, chance: FloatArray) -> MixedState:
-        """Return the state of the highest restricted likelihood."""
+        """Return the state of the highest restricted likelihood.
+
+        A source with a `chance` below 1 is counted only if noise alone would make it as likely with
+        at most that probability.
+        """
         G = self.noises
         free = np.where(np.concatenate([np.ones(G), chance]) < 1.0, 0.0, self.most)
         total = max(float(self.y @ self.y) / max(len(self.y) - self.parameters, 1), TINY)
@@ -104,33 +113,33 @@ class MixedModel:
         F, sure = state.information, np.flatnonzero(state.variances > 0.0)
         shared = np.linalg.lstsq(F[np.ix_(sure, sure)], F[np.ix_(sure, doubtful)], rcond=1e-12)[0]
         unshared = np.diagonal(F)[doubtful] - np.sum(F[np.ix_(sure, doubtful)] * shared, axis=0)
-        price = np.zeros(self.count)
-        q = state.degrees[doubtful - G]  # a score is distributed nearly as chi-square of q
-        beyond = (special.chdtri(q, chance[doubtful - G]) - q) / np.sqrt(2.0 * q)
-        price[doubtful] = beyond * np.sqrt(np.maximum(unshared, 0.0))
-        if (state.gradient[doubtful] <= price[doubtful]).all():
-            return state  # the highest, with or without them
+        penalty = np.zeros(self.count)
+        q = state.degrees[doubtful - G]  # the gradient is distributed nearly as chi-square of q
+        limit = (special.chdtri(q, chance[doubtful - G]) - q) / np.sqrt(2.0 * q)
+        penalty[doubtful] = limit * np.sqrt(np.maximum(unshared, 0.0))
+        if (state.gradient[doubtful] <= penalty[doubtful]).all():
+            return state  # no doubtful source is significant
         free = self.most.copy()
-        penalised = self._highest(state.variances, least, free, price)
+        penalised = self._highest(state.variances, least, free, penalty)
         free[doubtful] = np.where(penalised.variances[doubtful] > 0.0, free[doubtful], 0.0)
         return self._highest(penalised.variances, least, free, np.zeros(self.count))
 
     def _highest(
-        self, s: FloatArray, least: FloatArray, most: FloatArray, price: FloatArray
+        self, s: FloatArray, least: FloatArray, most: FloatArray, penalty: FloatArray
     ) -> MixedState:
-        """Return the state of the highest likelihood less price . s, from s on."""
+        """Return the state that maximises the log-likelihood less penalty . s, starting at s."""
         state = self.at(s)
         for _ in range(_SCORING_STEPS):
-            before = state.log_likelihood - price @ s
-            aim = np.clip(state.scored(price, most > least), least, most)
-            if (state.gradient - price) @ (aim - s) < _LIKELIHOOD_SETTLED:
+            before = state.log_likelihood - penalty @ s
+            target = np.clip(state.scored(penalty, most > least), least, most)
+            if (state.gradient - penalty) @ (target - s) < _LIKELIHOOD_SETTLED:
                 break
-            for length in _LENGTHS:
+            for length in _STEP_LENGTHS:
                 try:
-                    trial = self.at(s + length * (aim - s))
-                except np.linalg.LinAlgError:  # of sources far larger than the noise
+                    trial = self.at(s + length * (target - s))
+                except np.linalg.LinAlgError:  # sources are far larger than the noise
                     continue
-                rise = trial.log_likelihood - price @ trial.variances - before
+                rise = trial.log_likelihood - penalty @ trial.variances - before
                 if rise > 0.0:
                     break
             else:
@@ -177,7 +186,7 @@ class MixedState:
 
     @property
     def sizes(self) -> FloatArray:
-        """Variances of noises, what is known of them included, and of sources."""
+        """Variances of noises, their known parts included, and of sources."""
         G = self.model.noises
         return np.append(1.0 / self.weights[:G], self.variances[G:])
 
@@ -218,18 +227,19 @@ class MixedState:
     def chance_of(self, k: int, *, known: bool) -> float:
         """Return the probability that noise alone makes a source as likely as it is here.
 
-        By the ratio of restricted likelihoods. For few rows its distribution has no simple form, so
-        it is drawn. Rows of a known variance, such as priors, do not show an unknown scale:
-        what the parameters leave of them does not count as degrees of freedom. Source: Crainiceanu
-        and Ruppert, J. Royal Statistical Society B 66 (2004) 165.
+        It follows from the ratio of restricted likelihoods, whose distribution has no simple form
+        for few rows and is simulated. If the scale is not `known`, rows of a known variance, such
+        as priors, say nothing about it: their degrees of freedom are not counted. Source:
+        Crainiceanu and Ruppert, J. Royal Statistical Society B 66 (2004) 165.
         """
         columns = self.model.columns(k)
         model = self.model
-        sure = np.flatnonzero(model.group >= model.noises)
-        left_of_sure = float(
-            np.sum(np.diagonal(self.block(sure)) / self.weights[model.group[sure]])
-        )
-        rank = len(model.y) - model.parameters - (0.0 if known else left_of_sure)
+        rank = float(len(model.y) - model.parameters)
+        if not known:
+            stated = np.flatnonzero(model.group >= model.noises)
+            rank -= float(
+                np.sum(np.diagonal(self.block(stated)) / self.weights[model.group[stated]])
+            )
         values, vectors = np.linalg.eigh(self._Q[columns, columns])
         kept = np.flatnonzero(values > _RIDGE * values[-1])[-max(int(rank), 1) :]
         if not kept.size:  # the parameters explain all of it
@@ -241,17 +251,16 @@ class MixedState:
         drawn = rng.chisquare(1.0, (_DRAWS, len(kept)))
         others = rng.chisquare(max(rank - len(kept), TINY), _DRAWS)
         squares = np.vstack([seen, drawn])
-        left = np.append(unexplained, others)
+        other_squares = np.append(unexplained, others)
         best = np.zeros(1 + _DRAWS)
         for ratio in np.geomspace(*_RATIOS) / values[-1]:
             growth = 1.0 + ratio * values
             within = squares @ (1.0 / growth)
             total = squares.sum(axis=1)
-            rise = (
-                total - within
-                if known
-                else rank * np.log((total + left) / np.maximum(within + left, TINY))
-            )
+            rise = total - within
+            if not known:
+                after = np.maximum(within + other_squares, TINY)
+                rise = rank * np.log((total + other_squares) / after)
             best = np.maximum(best, rise - np.log(growth).sum())
         return float((best[1:] >= best[0]).sum() + 1) / (1 + _DRAWS)
 
@@ -269,8 +278,8 @@ class MixedState:
         first = self.model.starts - self.model.parameters
         return np.add.reduceat(columns, first, axis=0) if len(first) else columns[:0]
 
-    def scored(self, price: FloatArray, free: BoolArray) -> FloatArray:
-        """Return the variances >= 0 to which a scoring step leads, of the free ones."""
+    def scored(self, penalty: FloatArray, free: BoolArray) -> FloatArray:
+        """Return the variances >= 0 after a scoring step of the `free` ones."""
         from scipy.optimize import nnls
 
         F = self.information
@@ -283,9 +292,9 @@ class MixedState:
         values, vectors = np.linalg.eigh(scaled)
         root = np.sqrt(np.maximum(values, _RIDGE))  # rounding may leave some below zero
         R = root[:, None] * vectors.T
-        rise = units * (self.gradient - price)[part]
-        aim = R @ (s[part] / units) + (vectors.T @ rise) / root
-        s[part] = units * nnls(R, aim)[0]
+        gradient = units * (self.gradient - penalty)[part]
+        target = R @ (s[part] / units) + (vectors.T @ gradient) / root
+        s[part] = units * nnls(R, target)[0]
         return s
 
     @cached_property
@@ -323,23 +332,23 @@ class MixedState:
         return np.asarray(rows * (self.model.y - self.model.U @ self.predicted))
 
     def block(self, rows: IntArray) -> FloatArray:
-        """Return P of some rows, (r, r)."""
+        """Return the block of P of some rows, (r, r)."""
         w, U = self.weights[self.model.group[rows]], self.model.U[rows]
         return np.asarray(np.diag(w) - (w[:, None] * U) @ self.K @ (U.T * w))
 
-    def block_falls(self, rows: IntArray) -> FloatArray:
-        """Return by how much P of some rows falls with each variance, (count, r, r)."""
+    def block_slopes(self, rows: IntArray) -> FloatArray:
+        """Return minus the derivatives of `block` with respect to each variance, (count, r, r)."""
         model, group = self.model, self.model.group[rows]
-        w, falls = self.weights[group], []
+        w, slopes = self.weights[group], []
         WU = w[:, None] * model.U[rows]
         H = WU @ self.K @ WU.T
         for g, weight in enumerate(self.weights[: model.noises].tolist()):
             same, UK = weight * (group == g), weight * WU @ self.K
             inner = UK @ model.grams[g][:-1, :-1] @ UK.T
-            falls.append(np.diag(same**2) - same[:, None] * H - H * same + inner)
+            slopes.append(np.diag(same**2) - same[:, None] * H - H * same + inner)
         PU = WU @ self._left[:-1, :-1]
         parts = (PU[:, model.columns(k)] for k in range(len(model.starts)))
-        return np.array([*falls, *(part @ part.T for part in parts)])
+        return np.array([*slopes, *(part @ part.T for part in parts)])
 
     def prediction_variance(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariance of the errors of X [delta, u], and its derivatives.

@@ -209,7 +209,7 @@ def _forces(
     force, and the change decays over the characteristic displacement.
     """
     parts = stretches(x)
-    heading, farthest = parts.spread(parts.heading), float(parts.path.max()) or 1.0
+    heading, farthest = parts.spread(parts.direction), float(parts.path.max()) or 1.0
     friction, lengths = 0.0 * x, set[float]()
     for element, at in problem.model.of(problem.full_values(values)):
         if isinstance(element, Friction):

@@ -1,7 +1,7 @@
 """Errors of a fit to records: noise, model error, scatter between runs, fixed exponents and delay.
 
-A misfit differs between the parts of a record, and a device between runs. Estimates from blocks of
-the records, or from single records, then scatter more than noise explains; the excess is a separate
+A misfit changes along a record, and a device changes between runs. Estimates from blocks of the
+records, or from single records, then scatter more than noise explains; the excess is a separate
 source of error.
 """
 
@@ -25,10 +25,10 @@ from dahl_ident.fitting.record_search import STEPS, RecordSearch
 from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
-"""Number of blocks of all records together, from which the model error is estimated."""
-_SCATTER_CONFIDENCE = 0.9995  # confidence at which scatter between blocks exceeds the noise
-_RUNS_LEVEL = 0.95  # the same between records: rather counted too often than too seldom
-_LONG = 0.05  # step of an exponent's logarithm, above which the model is not linear
+"""Number of blocks into which all records together are divided to estimate the model error."""
+_BLOCKS_CONFIDENCE = 0.9995  # at which scatter between blocks exceeds the noise
+_RECORDS_CONFIDENCE = 0.95  # the same between records; lower, so that scatter is seldom missed
+_LINEAR = 0.05  # step of an exponent's logarithm up to which the model is linear
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
 
@@ -40,7 +40,7 @@ Sources: TypeAlias = Callable[["LinearFit"], Iterable[tuple[str, FloatArray]]]
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A fit of records to first order, with waves that are filtered as in the fit."""
+    """A fit of records to first order; residuals and derivatives are filtered as in the fit."""
 
     problem: RecordProblem
     values: FloatArray  # (P,): the estimate
@@ -57,7 +57,7 @@ class LinearFit:
         jacobians: Sequence[FloatArray],
         residuals: Sequence[FloatArray],
     ) -> LinearFit:
-        """Return the fit with these waves, which are filtered here."""
+        """Return the fit with these derivatives and residuals, which are filtered here."""
         J, e = ([problem.filtered(wave) for wave in waves] for waves in (jacobians, residuals))
         of_model = np.arange(values.size) < len(problem.free)
         return cls(problem, values, J, e, noise_in(J, e), of_model)
@@ -69,11 +69,11 @@ class LinearFit:
 
     @cached_property
     def between_blocks(self) -> FloatArray | None:
-        """Covariance between blocks in excess of noise; None if noise explains it."""
+        """Covariance from scatter between blocks in excess of noise; None if noise explains it."""
         if sum(e.size for e in self.residuals) < BLOCKS * BLOCKS:
             return None
         blocks = [[block] for block in blocks_of(self.residuals)]
-        return _between(self, blocks, self.by_noise[0], _SCATTER_CONFIDENCE)
+        return _between(self, blocks, self.by_noise[0], _BLOCKS_CONFIDENCE)
 
     @cached_property
     def inverse(self) -> FloatArray:
@@ -89,7 +89,7 @@ class LinearFit:
     def exponent_slopes(self) -> Mapping[str, Waves]:
         """Derivatives of the outputs with respect to ln of each fixed exponent, by name.
 
-        Empty if there is no motion close to the estimate.
+        Empty if the motion near the estimate cannot be computed.
         """
         problem = self.problem
         if not problem.exponents:
@@ -109,7 +109,7 @@ class LinearFit:
         }
 
     def with_freed(self, *slopes: Waves) -> LinearFit:
-        """Return the fit with more parameters at the end, which have these derivatives."""
+        """Return the fit with additional parameters at the end, which have these derivatives."""
         jacobians = [np.column_stack(waves) for waves in zip(self.jacobians, *slopes, strict=True)]
         of_model = np.append(self.of_model, np.ones(len(slopes), dtype=bool))
         return replace(self, jacobians=jacobians, of_model=of_model)
@@ -134,7 +134,7 @@ class LinearFit:
         return [self.problem.filtered(slope) for slope in self.problem.delay_slopes(self.values)]
 
     def covariance(self, sources: Sources | None = None) -> FloatArray:
-        """Return the covariance by noise, scatter between blocks and other `sources`, (P, P)."""
+        """Return the covariance from noise, scatter between blocks and other `sources`, (P, P)."""
         parts = [self.by_noise[0], self.between_blocks]
         parts += [part for _, part in sources(self)] if sources else []
         return np.asarray(sum(part for part in parts if part is not None))
@@ -142,21 +142,21 @@ class LinearFit:
 
 @dataclass(frozen=True)
 class FixedExponent:
-    """An exponent that the fit holds fixed, and what the records show of it."""
+    """An exponent that the fit holds fixed, and what the records show about it."""
 
     name: str
     unit: str
     value: float  # at which it is fixed
     range: tuple[float, float]  # in which it may lie; only `value` if the user stated it
-    std: float  # of its logarithm, by the records and its range together
+    std: float  # of its logarithm, from the records and the range together
     # ln of the estimate from the records alone, which may be outside the range, over `value`, and
     # its standard deviation
     log_ratio: float
     log_ratio_std: float
-    # (P, P): covariance of the estimate due to the exponent's error, as if it were estimated too,
-    # or due to its distance from the value that the records indicate, if that is larger
+    # (P, P): covariance of the estimate due to the exponent's uncertainty, or due to its distance
+    # from the value that the records indicate, whichever is larger
     contribution: FloatArray
-    assumed: bool  # whether the user did not state it
+    assumed: bool  # whether the fit assumes it, because the user stated none
 
     @property
     def contradicted(self) -> bool:
@@ -172,15 +172,15 @@ class FixedExponent:
 def fixed_exponents(
     fit: LinearFit, sources: Sources, exact: FloatArray
 ) -> tuple[FixedExponent, ...]:
-    """Return what the records show of each fixed exponent, stated or assumed.
+    """Return what the records show about each fixed exponent, stated or assumed.
 
-    Its uncertainty is that of noise, of scatter between blocks, and of `sources`; `exact` is the
-    covariance of the estimate by all of these with the exponents fixed.
+    Its uncertainty is due to noise, scatter between blocks, and `sources`; `exact` is the
+    covariance of the estimate due to all of these with the exponents fixed.
 
-    A stated exponent is estimated by a search in which it is free; an assumed one, which is close
-    to its optimum, by a Gauss-Newton step, and by a search if that step is long. As for tables, the
-    range is taken as a uniform distribution of the logarithm, with less weight if the records have
-    more information.
+    A stated exponent is estimated by a search in which it is free. An assumed one, which is close
+    to its optimum, is estimated by a Gauss-Newton step, and by a search if that step is long. As
+    for tables, the range is taken as a uniform distribution of the logarithm; its weight is less if
+    the records contain more information.
     """
     exponents = []
     for p in (p for p in fit.problem.exponents if p.name in fit.exponent_slopes):
@@ -191,8 +191,8 @@ def fixed_exponents(
         ratio, ratio_std = freed.change, float(freed.covariance[-1, -1]) ** 0.5
         mean, s = float(np.clip(ratio, low, high)), (high - low) / 12**0.5
         std, covariance = freed.with_prior(mean, s, exact)
-        if not p.assumed or abs(ratio) > max(_LONG, _CONTRADICTED * ratio_std):
-            with suppress(FitError):  # no motion at values that the search tries
+        if not p.assumed or abs(ratio) > max(_LINEAR, _CONTRADICTED * ratio_std):
+            with suppress(FitError):  # the motion cannot be computed at values that are tried
                 ratio, ratio_std = _searched_ratio(fit, p.name, sources) or (ratio, ratio_std)
         exponents.append(
             FixedExponent(
@@ -205,16 +205,16 @@ def fixed_exponents(
 def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float, float] | None:
     """Return ln of an exponent's estimate over its value, and its standard deviation, by a search.
 
-    The displacement's noise is estimated again, as its estimate with the exponent fixed may contain
-    misfit. None if the fixed exponent describes the records better.
+    None if the fixed exponent describes the records better. The noise of the displacement is
+    estimated again, because its estimate with the exponent fixed may contain misfit.
     """
     problem = fit.problem
     search, free = RecordSearch("lm", "linear"), problem.freed([name])
     i = free.names.index(name)
     (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
-    begin = free.to_search(np.insert(fit.values, i, value))
-    cost, free = float(free.quadratic(begin).cost), free.smoothed(on=False).without_noise(0.0)
-    end = search.descend(free, begin, STEPS)
+    start = free.to_search(np.insert(fit.values, i, value))
+    cost, free = float(free.quadratic(start).cost), free.smoothed(on=False).without_noise(0.0)
+    end = search.descend(free, start, STEPS)
     if problem.output == "force":
         free, end = search.without_noise(free, end)
     if not end.converged[0] or not end.cost[0] < cost:
@@ -230,8 +230,8 @@ def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float,
 def by_delay(fit: LinearFit) -> FloatArray:
     """Return the covariance of the estimate due to the delay, which the user did not state.
 
-    Its prior has the standard deviation of one sample, with less weight if the records have more
-    information; the estimated delay is removed already, unless it is too long for that.
+    The estimated delay has been removed, unless it is too long for that. The prior of the rest has
+    a standard deviation of one sample; its weight is less if the records contain more information.
     """
     sample = 1.0 / fit.problem.records[0].sample_rate
     freed = _FreedValue.of(fit, [sample * slope for slope in fit.delay_slopes])
@@ -241,13 +241,13 @@ def by_delay(fit: LinearFit) -> FloatArray:
 class _FreedValue(NamedTuple):
     """A value that a fit holds fixed, estimated by a Gauss-Newton step."""
 
-    change: float  # of the value, by the records
-    covariance: FloatArray  # (P + 1, P + 1): of the values and, last, of this one
+    change: float  # its estimate from the records minus the fixed value
+    covariance: FloatArray  # (P + 1, P + 1): of the other values and, last, of this one
     others: FloatArray  # (P,): changes of the other values per change of this one
 
     @classmethod
     def of(cls, fit: LinearFit, slopes: Waves, sources: Sources | None = None) -> _FreedValue:
-        """Return the value with these derivatives of the outputs."""
+        """Return the value with respect to which `slopes` are derivatives of the outputs."""
         joint = fit.with_freed(slopes)
         others = np.zeros(len(joint.inverse) - 1)
         if any(slope.any() for slope in slopes):  # without a drive, a delay has no effect
@@ -258,9 +258,9 @@ class _FreedValue(NamedTuple):
     def with_prior(self, mean: float, s: float, exact: FloatArray) -> tuple[float, FloatArray]:
         """Return the standard deviation of the value, and what it adds to the others' covariance.
 
-        `mean` is the estimate by the records, `s` the standard deviation of the prior, which is
-        widened where the records contradict it; `exact` is the covariance of the others where this
-        value is exact.
+        `mean` is the estimate from the records, `s` the standard deviation of the prior, which is
+        widened if the records contradict it, and `exact` the covariance of the other values if
+        this one is exact.
         """
         u2, C = float(self.covariance[-1, -1]), self.covariance
         line = np.outer(self.others, self.others)
@@ -279,7 +279,7 @@ class _FreedValue(NamedTuple):
 
 
 def blocks_of(waves: Sequence[FloatArray], blocks: int = BLOCKS) -> list[tuple[int, IntArray]]:
-    """Return the number of each block's record, and the block's samples in it."""
+    """Return the blocks, each as the number of its record and the samples in that record."""
     samples = sum(len(wave) for wave in waves)
     return [
         (number, rows)
@@ -291,7 +291,7 @@ def blocks_of(waves: Sequence[FloatArray], blocks: int = BLOCKS) -> list[tuple[i
 
 
 def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
-    """Return the covariance between records in excess of the `known` one; None by chance.
+    """Return the covariance between records in excess of `known`; None if chance explains it.
 
     A record counts once, however many samples or parts it has: the problem's `runs` state to which
     record each part belongs.
@@ -300,7 +300,7 @@ def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
     whole = [np.arange(e.size) for e in fit.residuals]
     members = [np.flatnonzero(runs == run).tolist() for run in np.unique(runs)]
     records = [[(i, whole[i]) for i in each] for each in members]
-    return _between(fit, records, known, _RUNS_LEVEL) if len(records) > 1 else None
+    return _between(fit, records, known, _RECORDS_CONFIDENCE) if len(records) > 1 else None
 
 
 def _between(
@@ -309,10 +309,11 @@ def _between(
     noise: FloatArray,
     level: float,
 ) -> FloatArray | None:
-    """Return the covariance between groups of samples in excess of `noise`; None by chance.
+    """Return the covariance between groups of samples in excess of `noise`.
 
-    A group is a list of records' numbers, each with samples. The covariance between groups is that
-    of Liang and Zeger, Biometrika 73 (1986) 13-22.
+    None if chance explains it at the confidence `level`. A group is a list of records' numbers with
+    samples of each. The covariance between groups is that of Liang and Zeger, Biometrika 73 (1986)
+    13-22.
     """
     seen = np.flatnonzero(np.isfinite(noise.diagonal()))
     inside = np.ix_(seen, seen)
@@ -334,6 +335,6 @@ def _between(
     ratio = between.diagonal() / by_chance.diagonal()
     if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[fit.of_model[seen]].any():
         return None
-    excess = np.zeros(noise.shape)
-    excess[inside] = positive_part(between - by_chance) * units
-    return excess
+    covariance = np.zeros(noise.shape)
+    covariance[inside] = positive_part(between - by_chance) * units
+    return covariance

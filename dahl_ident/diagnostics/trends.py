@@ -1,17 +1,19 @@
 """Trends of the residuals with amplitude, frequency or drive, which show a wrong model.
 
-For each covariate that varies, the response may have a smooth relative departure from the model,
-R exp(u), where u is a complex polynomial of the covariate's logarithm, for gain and phase. The part
-that the parameters could explain is removed (:mod:`dahl_ident.diagnostics.residual_space`); an F or
-chi-square test shows whether the remainder exceeds the noise. The size of the departure is given in
-percent, so that a significant trend can be distinguished from one that matters. A Wald-Wolfowitz
-test of the residuals' signs detects departures that no low polynomial follows.
+**Trends.** For each covariate that varies, a smooth relative departure R exp(u) from the predicted
+response R is fitted, where u, for gain and phase, is a complex polynomial of the logarithm of the
+covariate. The part that the parameters could explain is removed
+(:mod:`dahl_ident.diagnostics.residual_space`); an F or chi-square test shows whether the remainder
+exceeds the noise. The size of the departure is given in percent, so that a significant trend can be
+distinguished from one that matters. A Wald-Wolfowitz test of the residuals' signs detects
+departures that no polynomial of low degree describes.
 
-A stiffness that rises with amplitude contradicts every law that softens, whatever its parameters
-and whatever the rest of the misfit. No curve is assumed: the real part of the dynamic stiffness,
-minus that of the linear elements, is fitted by a straight line over ln A in each of a few bands,
-together with the correction of a free mass, by weighted least squares; the values at the centres
-are compared. Rows that are predicted by the exact steady motion are not tested.
+**Stiffening.** A stiffness that rises with amplitude contradicts every law that softens, whatever
+its parameters and the rest of the misfit are. No curve is assumed: the range of ln A is divided
+into a few bands, and in each the real part of the dynamic stiffness, minus that of the linear
+elements, is fitted by a straight line, by weighted least squares and together with the correction
+of a free mass. The values at the centres of the bands are compared. Rows that are predicted by the
+exact steady motion are not tested.
 """
 
 from __future__ import annotations
@@ -33,23 +35,23 @@ from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, Re
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import COMPLIANCES, percent, shown_unit
 
-_BANDS = 8  # of the range of amplitudes: few, so that each has enough rows
-_NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude
+_BANDS = 8  # number of bands of amplitude: few, so that each has enough rows
+_NARROWEST = np.log(1.1)  # least width of a band of ln A
 _FEWEST_ROWS = 3  # in a band
 LEAST_DOF = 6  # least degrees of freedom of a test of residuals of unknown scale
-_DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
+_DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}  # highest, of polynomials
 _FEWEST_IN_A_GROUP = 3  # rows on average
-_SAME_COVARIATE = 0.01  # of the covariate's logarithm: closer values are equal
+_SAME_COVARIATE = 0.01  # difference of a covariate's logarithm up to which values are equal
 LEAST_RANGE = np.log(1.05)  # of the logarithm of a covariate that varies
-_LEAST_DOF_PER_COLUMN = 3  # for each shape; with fewer, tests detect little
-_FEWEST_SIGNS = 10  # of each sign on average, for a normal number of runs
+_LEAST_DOF_PER_COLUMN = 3  # with fewer for each polynomial, tests detect little
+_FEWEST_SIGNS = 10  # of each sign on average; the number of runs is then nearly normal
 _STEEPEST = np.log(10.0)  # largest change of a logarithm that is stated as a number
-_LARGEST_DEPARTURE = 9.0  # the same of a relative departure
+_LARGEST_DEPARTURE = 9.0  # largest relative departure that is stated as a number
 
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """What a test of the residuals shows, and the probability that noise alone shows as much."""
+    """The result of a test of the residuals, with the probability that it is due to noise alone."""
 
     kind: str
     p_value: float
@@ -63,11 +65,11 @@ class ResidualTest:
 
 
 def stiffening(optimum: Optimum) -> ResidualTest | None:
-    """Return the most significant rise of stiffness with amplitude; None where there is none.
+    """Return the most significant rise of stiffness with amplitude; None if there is no rise.
 
-    Its p-value is that of such a rise by noise alone over all pairs of bands. `low` and `high` are
-    the geometric means of the amplitudes in two bands, and `rise` is relative to the stiffness at
-    `low`.
+    The p-value is the probability of such a rise between any two bands by noise alone. `low` and
+    `high` are the geometric means of the amplitudes in the two bands, and `rise` is relative to the
+    stiffness at `low`.
     """
     elements = optimum.problem.model.elements
     friction = [e for e in elements if not e.is_linear]
@@ -140,7 +142,7 @@ def groups(optimum: Optimum, space: ResidualSpace) -> Iterator[ResidualTest]:
     """
     data = optimum.problem.data
     amplitude = np.log(optimum.problem.stiffness_data.amplitude)
-    columns = {} if "verdict" in data.quality else dict(data.quality)  # not the extraction's
+    columns = {} if "verdict" in data.quality else dict(data.quality)  # but not extraction's
     if data.level is not None:
         columns["level"] = data.level
     for name, labels in columns.items():
@@ -245,9 +247,9 @@ def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
 
 
 def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
-    """Return the relative change of the response with the friction's real and imaginary part.
+    """Return the relative changes of the response per ln of friction's stiffness and loss.
 
-    The real part is that of friction and springs together if only their sum is determined.
+    The stiffness is that of friction and springs together if only their sum is determined.
     """
     problem = optimum.problem
     values = parameter_values(optimum)

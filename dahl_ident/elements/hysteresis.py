@@ -41,14 +41,14 @@ def force_history(
     cut = stretches(displacement)
     legs, path = (_path(length, sigma / f_max) for length in (cut.length, cut.path))
     if alpha == 1.0:
-        margin = 1.0 - cut.heading * _linear_turning_forces(
-            initial_force / f_max, cut.heading, legs
+        margin = 1.0 - cut.direction * _linear_turning_forces(
+            initial_force / f_max, cut.direction, legs
         )
     else:
-        margin = _turning_margins(1.0 - cut.heading[0] * initial_force / f_max, legs, alpha)
+        margin = _turning_margins(1.0 - cut.direction[0] * initial_force / f_max, legs, alpha)
     start = cut.spread(margin)
     force = (1.0 - start) - _margin_change(start, path, alpha)
-    force *= cut.spread(cut.heading * f_max)
+    force *= cut.spread(cut.direction * f_max)
     force[0] = initial_force
     return force
 
@@ -69,16 +69,16 @@ def linear_history_gradient(
     """
     cut = stretches(displacement)
     legs, path = (_path(length, sigma / f_max) for length in (cut.length, cut.path))
-    turning = f_max * _linear_turning_forces(initial_force / f_max, cut.heading, legs)
+    turning = f_max * _linear_turning_forces(initial_force / f_max, cut.direction, legs)
 
     def slopes(start: FloatArray, s: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         by_ln_d = (s * f_max - start) * d * np.exp(-d)
         return np.exp(-d), np.column_stack([-s * np.expm1(-d) - by_ln_d / f_max, by_ln_d / sigma])
 
-    keep, terms = slopes(turning[:-1], cut.heading[:-1], legs)
+    keep, terms = slopes(turning[:-1], cut.direction[:-1], legs)
     first = np.array([1.0, 0.0, 0.0])
     at_turns = linear_recursion(keep, np.column_stack([np.zeros(keep.size), terms]), first)
-    start, s = cut.spread(turning), cut.spread(cut.heading)
+    start, s = cut.spread(turning), cut.spread(cut.direction)
     keep, terms = slopes(start, s, path)
     gradient = keep[:, None] * cut.spread(at_turns)
     gradient[:, 1:] += terms

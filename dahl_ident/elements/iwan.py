@@ -33,8 +33,8 @@ from dahl_ident.elements.parameter import Parameter
 
 _SLIDERS = 30  # Jenkins elements that replace the law under a driving force; error 2e-4 of f_max
 _FEW_SLIDERS = 8  # error 3e-3 of f_max, at a tenth of the cost: for the first part of a search
-_REST = 1e-100  # m, in place of smaller amplitudes: d_m/A does not overflow
-_SMALLEST_KNEE = 1e-6  # of the onset: near chi = -1 even the smallest amplitudes lose stiffness
+_REST = 1e-100  # m: replaces smaller amplitudes, so that d_m/A does not overflow
+_SMALLEST_KNEE = 1e-6  # least knee over the onset; as chi tends to -1, the knee tends to zero
 
 
 class Iwan(Masing):
@@ -110,7 +110,7 @@ class Iwan(Masing):
     n_states = _SLIDERS
 
     def coarser(self) -> Iwan:
-        """Return this law with fewer Jenkins elements to replace it."""
+        """Return this law, replaced by fewer Jenkins elements."""
         copy = self.copy_with(self.parameters)
         copy.n_states = _FEW_SLIDERS
         return copy

@@ -1,4 +1,4 @@
-"""The laws that users write: read from their Python files, described, and required."""
+"""The laws that users write: loading them from Python files, describing them, requiring them."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ def load_laws(path: str | Path) -> tuple[type[Element], ...]:
 
 
 def user_laws(elements: Iterable[Element]) -> list[type[Element]]:
-    """Return the classes of a model's laws that a user has written, also of those behind gaps."""
+    """Return the classes of a model's laws that users have written, including laws behind gaps."""
     laws = (type(part) for element in elements for part in (element, *element.inner_elements))
     return list(dict.fromkeys(law for law in laws if not is_of_package(law)))
 
 
 def describe_laws(elements: Iterable[Element]) -> list[dict[str, Any]]:
-    """Return where the laws of a model that a user has written are defined, as plain data."""
+    """Return, as plain data, where the user-written laws of a model are defined."""
     descriptions = []
     for law in user_laws(elements):
         file = file_of(law)
@@ -76,7 +76,7 @@ def describe_laws(elements: Iterable[Element]) -> list[dict[str, Any]]:
 
 
 def require_laws(laws: Sequence[Mapping[str, Any]], holder: str) -> None:
-    """Raise ModelError if a law that :func:`describe_laws` described is not registered."""
+    """Raise ModelError if a law described by :func:`describe_laws` is not registered."""
     for law in laws:
         if law["kind"] not in KINDS:
             file = law["file"] or "an interactive session, which no file holds"

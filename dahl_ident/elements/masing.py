@@ -193,7 +193,7 @@ def _paths(
     open_paths: list[int] = []  # begun and not yet closed, outermost first
     cut = stretches(u)
     first = 0
-    for heading, last in zip(cut.heading.tolist(), np.cumsum(cut.samples) - 1, strict=True):
+    for heading, last in zip(cut.direction.tolist(), np.cumsum(cut.samples) - 1, strict=True):
         stop = min(int(last) + 1, u.size - 1)
         here = float(u[first])
         if open_paths or heading * here < 0.0:

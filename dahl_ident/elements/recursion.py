@@ -1,4 +1,4 @@
-"""Histories with memory: stretches of one direction, and linear recursions over many samples."""
+"""Forces that depend on the history: motion in one direction, and linear recursions."""
 
 from __future__ import annotations
 
@@ -12,40 +12,40 @@ from dahl_ident.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Stretches:
-    """A displacement cut where its direction changes; m stretches of n samples.
+    """A displacement of n samples, divided into m stretches of one direction each.
 
     Attributes
     ----------
-    heading : ndarray, shape (m,)
+    direction : ndarray, shape (m,)
         +1 or -1.
     length : ndarray, shape (m - 1,)
-        Path of every stretch but the last, m.
+        Length of every stretch except the last, m.
     path : ndarray, shape (n,)
-        Path of every sample from the turning point before it, m.
+        Path from the last turning point to every sample, m.
     samples : ndarray of int, shape (m,)
-        Samples of every stretch.
+        Number of samples in every stretch.
     """
 
-    heading: FloatArray
+    direction: FloatArray
     length: FloatArray
     path: FloatArray
     samples: np.ndarray[tuple[int], np.dtype[np.intp]]
 
     def spread(self, values: FloatArray) -> FloatArray:
-        """Return the values of stretches, (m, ...), at every sample, (n, ...)."""
+        """Return values of the stretches, (m, ...), at every sample, (n, ...)."""
         return np.repeat(values, self.samples, axis=0)
 
 
 def stretches(displacement: FloatArray) -> Stretches:
-    """Return a displacement's stretches of one direction.
+    """Return the stretches of a displacement.
 
-    A step of 0 keeps the direction of the motion before it. A turning point belongs to the stretch
-    that it begins.
+    A step of zero continues the direction of the step before it. A turning point belongs to the
+    stretch that starts there.
 
     Examples
     --------
-    >>> cut = stretches(np.array([0.0, 1.0, 3.0, 2.0]))
-    >>> cut.heading.tolist(), cut.length.tolist(), cut.path.tolist()
+    >>> parts = stretches(np.array([0.0, 1.0, 3.0, 2.0]))
+    >>> parts.direction.tolist(), parts.length.tolist(), parts.path.tolist()
     ([1.0, -1.0], [3.0], [0.0, 1.0, 0.0, 1.0])
     """
     if displacement.size < 2:
@@ -56,10 +56,10 @@ def stretches(displacement: FloatArray) -> Stretches:
         last = np.maximum.accumulate(np.where(moves, np.arange(steps.size), moves.argmax()))
         steps = np.where(steps[last] < 0.0, -1.0, 1.0)
     turns = np.concatenate(([0], np.flatnonzero(steps[1:] != steps[:-1]) + 1))
-    corner = displacement[turns]
+    turning_points = displacement[turns]
     samples = np.diff(turns, append=displacement.size)
-    path = np.abs(displacement - np.repeat(corner, samples))
-    return Stretches(steps[turns], np.abs(np.diff(corner)), path, samples)
+    path = np.abs(displacement - np.repeat(turning_points, samples))
+    return Stretches(steps[turns], np.abs(np.diff(turning_points)), path, samples)
 
 
 def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
-"""From an expression graph to machine code: every operation is one LLVM instruction.
+"""From an expression graph to machine code: every operation becomes one LLVM instruction.
 
-numba links the result and gives it the type of a C function. Its own compiler would first infer the
-types of thousands of lines, all of which are numbers.
+numba links the result and gives it the type of a C function. Its compiler is not used for the
+operations, because it would infer the types of thousands of lines, all of which are numbers.
 """
 
 from __future__ import annotations
@@ -36,10 +36,12 @@ _NAMES = {
 class Step(NamedTuple):
     """One operation: its name and its arguments.
 
-    The name is that of an operation of casadi, with the numbers of earlier steps, whose results it
-    uses; "CONST" with a number; "INPUT" with an index of the array; "OUTPUT" with an index and a
-    step; "LEVEL" with the level below which the function returns; or "BEGIN", which ends the
-    operations of level -1.
+    - "CONST": a number.
+    - "INPUT": an index of the array.
+    - "OUTPUT": an index of the array, and the number of the step whose result is written there.
+    - "LEVEL": the level below which the function returns.
+    - "BEGIN": no arguments; ends the operations of level -1.
+    - An operation of casadi: the numbers of the steps whose results it uses.
     """
 
     name: str
@@ -47,9 +49,9 @@ class Step(NamedTuple):
 
 
 def steps_of(graph: ca.Function, indices: Sequence[Sequence[int]]) -> tuple[Step, ...]:
-    """Return the operations of a function of one vector, whose outputs are levels.
+    """Return the operations of a function of one vector; each output is one level.
 
-    `indices` are those of the array at which the nonzeros of each output are written.
+    `indices` has, for each output, the indices of the array at which its nonzeros are written.
     """
     steps: list[Step] = []
     latest: dict[int, int] = {}  # the last step that wrote to an element of casadi's memory
@@ -80,10 +82,11 @@ def steps_of(graph: ca.Function, indices: Sequence[Sequence[int]]) -> tuple[Step
 
 
 def prepared(steps: Sequence[Step], first: int, last: int) -> tuple[tuple[Step, ...], int]:
-    """Return the steps, those first that depend on constants and inputs `first` to `last` only.
+    """Return the steps in another order, and the number of results that are stored.
 
-    Those are executed once for many calls, at level -1. Their results are stored in the array from
-    index `last` on, before the outputs. The number of these results is returned too.
+    Steps that depend only on constants and on inputs `first` to `last` come first. They are
+    executed once for many calls, at level -1, and their results are stored in the array from index
+    `last` on, before the outputs.
     """
     fixed = [False] * len(steps)
     for i, (name, values) in enumerate(steps):
@@ -169,7 +172,9 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
     def holds(a: Any) -> Any:
         return builder.fcmp_unordered("!=", a, zero)
 
-    def power(a: Any, b: Any) -> Any:  # at 0 it is 0 unless b is: at rest on a kink slopes are 0
+    def power(
+        a: Any, b: Any
+    ) -> Any:  # 0^b is 0 for any b but 0, so that slopes at kinks are finite
         at_zero = as_number(builder.fcmp_ordered("==", b, zero))
         positive = call("llvm.exp.f64", builder.fmul(b, logarithm(a)))  # shares the logarithm
         before = builder.block
@@ -180,7 +185,7 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
         result.add_incoming(negative, inside)
         return builder.select(builder.fcmp_ordered("==", a, zero), at_zero, result)
 
-    def not_zero(a: Any) -> Any:  # so that a logarithm and the slope of a root are finite at 0
+    def not_zero(a: Any) -> Any:  # logarithms and the slopes of roots are then finite at 0
         tiny = ir.Constant(number, float(np.finfo(np.float64).tiny))
         return builder.select(builder.fcmp_ordered("==", a, zero), tiny, a)
 

@@ -64,17 +64,17 @@ class System:
     function : callable
         ``f(numbers)``, a numba C function of one array: inputs, then outputs. Inputs: the level (0
         for values, 1 also for derivatives with respect to the states, 2 also with respect to drive
-        and parameters), states, drive, direction, sides of the switches, parameters. Level -1, to
-        be called once for the parameters, computes the quantities that depend on them only, and
-        stores these after the inputs. Outputs: rates, output and switching functions; their
-        derivatives with respect to the states, row by row; those with respect to drive and
-        parameters, row by row. Zeros are not written.
+        and parameters), states, drive, direction, sides of the switches, parameters. A call with
+        level -1 is needed once for every set of parameters: it computes the quantities that depend
+        only on them, and stores these after the inputs. Outputs: rates, output and switching
+        functions; their derivatives with respect to the states, row by row; those with respect to
+        drive and parameters, row by row. Zeros are not written.
     sizes : ndarray of int, shape (6,)
         Numbers of states, switches, parameters; 1 if the displacement is held, otherwise 0; 1 if
         the output for a held displacement depends on its speed, otherwise 0; number of stored
         quantities that depend on parameters only.
     solved : ndarray of int
-        States for which the stages of a step are solved.
+        States for which the equations of an implicit step are solved.
     followers : ndarray of int
         States that change in proportion to the displacement while no switch changes its side, such
         as the forces of Jenkins elements. They need no integration.
@@ -164,10 +164,11 @@ _EVEN_FUNCTIONS = (ca.OP_COS, ca.OP_COSH)
 
 
 def _factors(equations: Equations, states: Sequence[float], others: float) -> list[float]:
-    """Return the factors of rates and output when the states, and drive and direction, have some.
+    """Return the factors by which rates and output change if their arguments are multiplied.
 
-    They follow from the expression, for all numbers: NaN if there is no such factor, or the
-    expression does not show it; 0 if the result is zero.
+    The states are multiplied by `states`, drive and direction by `others`. The factors hold for all
+    numbers, as they follow from the expression: NaN if there is no such factor or the expression
+    does not show it; 0 if the result is zero.
     """
     symbols = [*equations.states, equations.drive, equations.direction, *equations.parameters]
     outputs = ca.vertcat(equations.rates, equations.output)

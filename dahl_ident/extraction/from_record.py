@@ -1,15 +1,15 @@
 """From a record to a frequency response: segments, sine fits, verdicts, one table.
 
-Pieces of a record may end within a level. Each part of the level, with n_i cycles, then gives a
-point, and these are combined with weights w_i = n_i / sum n:
+A record may be read in pieces, which may end within a level. Each part of the level, with n_i
+cycles, then gives a point, and these are combined with weights w_i = n_i / sum n:
 
     N = sum w_i N_i,      C = sum w_i^2 (C_i - R_i) + sum w_i R_i
 
-R is the part due to rounding and aliasing, which repeats in every cycle. A part that has not
-settled counts as settling periods of the part that has.
+R is the part of C due to rounding and aliasing, which is the same in every cycle. The cycles of a
+part that has not settled count as settling periods of the next part.
 
 A record that is not a sine measurement is refused. In a sine test almost every cycle, weighted by
-energy, is like the one before it; in random motion a few are, by chance.
+energy, is like the one before it; in random motion only a few are, by chance.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ from dahl_ident.units import counted, percent
 _NEGLIGIBLE_BIAS = 0.2  # bias over standard error down to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
-_WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are no coincidence
+_WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are not due to chance
 _MISSING_CYCLES = 3.0  # largest number between two parts of one level
-_PERIOD_CHANGE = 0.03  # largest relative change from cycle to cycle of a sine (median by energy)
-_AMPLITUDE_CHANGE = 0.1  # largest change likewise; at a resonance, amplitudes change faster
-_SWEEP_RANGE = 0.2  # least change of log period over a sweep; less may be chance
-_SWEEP_CYCLES = 6  # least number; they give four second differences of the period
+_PERIOD_CHANGE = 0.03  # largest change of log period between cycles of a sine (median by energy)
+_AMPLITUDE_CHANGE = 0.1  # the same of log amplitude, which changes faster at a resonance
+_SWEEP_RANGE = 0.2  # least change of log period over a sweep; less may be due to chance
+_SWEEP_CYCLES = 6  # least number in a sweep: they give four second differences of the period
 _FEWEST_PAIRS = 2  # neighbouring cycles needed to judge how similar cycles are
 _NOISY = 0.03  # noise of the log amplitude from which cycles cannot be compared
 # Least fraction of the power near the strongest line of a sine whose cycles differ:
@@ -158,16 +158,19 @@ def _check_share(fit: SineFit, segment: Segment, settings: Settings, lost: Float
 
 
 def _settling_periods(phasors: Phasors, cycles: int) -> int:
-    """Return how many leading cycles to leave out, from the fundamental of the first cycles."""
+    """Return the number of leading cycles to leave out, found from the fundamental."""
     q = np.arange(cycles - FEWEST_CYCLES + 1)
     ratio = phasors.cycles / (cycles - q)
     bias = abs(phasors.bias[0]) * np.exp(-phasors.transient.rate * q) * ratio
     error = np.sqrt(phasors.fundamental[1][0, 0] * ratio)
-    negligible = bias <= _NEGLIGIBLE_BIAS * error  # if it never is: the least mean square error
-    return int(np.argmax(negligible) if negligible.any() else np.argmin(bias**2 + 2.0 * error**2))
+    negligible = bias <= _NEGLIGIBLE_BIAS * error
+    if negligible.any():
+        return int(np.argmax(negligible))
+    return int(np.argmin(bias**2 + 2.0 * error**2))  # the least mean square error
 
 
 def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
+    """Return the point of phasors, with its verdicts; `dropped` of `cycles` were left out."""
     distorted = phasors.distorted
     response, joint, dof = phasors.rows(distorted)
     no_noise = {k: LineNoise(np.zeros_like(n.lines), n.dof) for k, n in phasors.noise.items()}
@@ -220,7 +223,7 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
 def record_response(
     pieces: Iterable[Record], settings: Settings, level: ArrayLike | None, run: str | None
 ) -> FrequencyResponse:
-    """Return the points of a record in pieces; a level that continues in the next is one point."""
+    """Return the points of a record in pieces; a level in two pieces becomes one point."""
     points: list[Point] = []
     refused: list[str] = []
     noted: dict[str, None] = {}  # warnings of the reader
@@ -338,9 +341,10 @@ def _is_sweep(runs: Sequence[Cycles]) -> bool:
 
 
 def _neighbour_changes(runs: Sequence[Cycles]) -> tuple[float, float, float, int]:
-    """Return medians, weighted by energy, over pairs of neighbouring cycles, and their number.
+    """Return medians over pairs of neighbouring cycles, and the number of pairs.
 
-    The medians are those of the noise, and of the changes of log period and log amplitude.
+    The medians, weighted by energy, are those of the noise, of the change of log period, and of the
+    change of log amplitude.
     """
     pairs = [
         (
@@ -423,7 +427,7 @@ def _table(
 
 
 def joined(points: list[Point], next_points: list[Point]) -> list[Point]:
-    """Return the points of one piece and of the next; a level in both becomes one point."""
+    """Return the points of one piece and of the next; a level in both pieces is one point."""
     if not points or not next_points:
         return [*points, *next_points]
     a, b = points[-1], next_points[0]

@@ -9,20 +9,20 @@ resampling. A phasor is ``Y_k = c_k - j s_k``. The phase ``theta`` is a polynomi
 from -1 to 1 over the segment, known or estimated jointly from both channels, the four-parameter fit
 of IEEE Std 1057. In a sweep each harmonic may change linearly with time.
 
-Where there are many samples per cycle, means of blocks, 256 per cycle, replace them. The mean of m
-samples, spaced by the phase p, has harmonic k reduced by D_k = sin(m k p/2) / (m sin(k p/2)); the
-fit reduces its columns by the same factor.
+If there are many samples per cycle, they are replaced by means of blocks, 256 per cycle. In the
+mean of m samples, spaced by the phase p, harmonic k is reduced by the factor
+D_k = sin(m k p/2) / (m sin(k p/2)); the columns of the fit are reduced by the same factor.
 
-Noise of the phasors: over P whole cycles, whatever repeats lies on the harmonics. The content of
+Noise of the phasors: over P whole cycles, everything periodic lies on the harmonics. The content of
 the lines between them, at ``f = (k + m/P) f_0``, is noise near the frequency of interest. With Z_i
 the content of line i in both channels, the cross-spectral matrix at the harmonic is
 
     C = sum_i f_i Z_i Z_i^H / sum_i f_i
 
 The lines are symmetric about the harmonic, so the expectation is right for every noise spectrum
-``a + b/f``. With P >= 4, lines within half a harmonic are used, otherwise all up to the next
-harmonics. The noise is taken as circular: n lines of equal weight give 2 n degrees of freedom. The
-noise of the mean (k = 0) is that of the lowest lines, and white below them.
+``a + b/f``. With P >= 4, lines within half a harmonic are used, otherwise all lines up to the next
+harmonics. The noise is assumed to be circular: n lines of equal weight give 2 n degrees of freedom.
+The noise of the mean (k = 0) is estimated from the lowest lines, and assumed to be white below.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray, IntArray
 from dahl_ident.data.record import is_even
 from dahl_ident.errors import ExtractionError, argument
 
-FEWEST_CYCLES = 2  # needed to fit offset and drift in addition
+FEWEST_CYCLES = 2  # needed to fit offset and drift as well
 HARMONICS = 9  # least number of fitted harmonics, if the sampling can separate them
-_MOST_HARMONICS = 40  # fitted at most, against leakage if a cycle is not a whole number of samples
-_AFFORDABLE = 4e5  # samples times harmonics; with more samples leakage is less, so fewer suffice
+_MOST_HARMONICS = 40  # largest number; they reduce leakage if a cycle is no whole number of samples
+_AFFORDABLE = 4e5  # samples times harmonics; with more samples there is less leakage
 _NYQUIST_MARGIN = 0.45  # frequency of the highest harmonic over the sampling rate
 _SAMPLES_AT_ONCE = 16384  # samples computed at once, so that their columns stay in the cache
 _KEPT = 2_000_000  # entries of the columns up to which they are stored, not computed twice
@@ -56,7 +56,7 @@ _STEP_TOLERANCE = 1e-4  # rad of phase at the ends of the segment; the remaining
 CYCLES_FOR_SCATTER = 4  # with fewer, lines next to the harmonic are few and distant
 _MOST_LINES = 10  # on either side: 40 degrees of freedom; more hardly narrow an interval
 _MEAN_LINES = 4  # lowest spectral lines, from which the noise of the mean is estimated
-_INDEPENDENT = 0.05  # fraction of the largest eigenvalue; lines that gaps make dependent are below
+_INDEPENDENT = 0.05  # of the largest eigenvalue; smaller ones are of lines that depend on others
 _NOISE_BLOCKS_PER_CYCLE = 128  # averages lose 1 % of slow noise at the ninth harmonic
 
 
@@ -418,7 +418,7 @@ def checked_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
 
 @dataclass(frozen=True)
 class LineNoise:
-    """Noise near one harmonic: scaled `lines`, (2, lines), whose products sum to `matrix`."""
+    """Noise near one harmonic: scaled spectral lines, (2, lines); `matrix` sums their products."""
 
     lines: ComplexArray
     dof: float
@@ -481,7 +481,7 @@ def _line_content(
 def _block_sums(
     theta: FloatArray, residual: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return phases, sums of the residual and numbers of samples of about 128 blocks per cycle."""
+    """Return phase, sum of the residual and number of samples of about 128 blocks per cycle."""
     starts, counts = _phase_blocks(theta, _NOISE_BLOCKS_PER_CYCLE)
     if 2 * starts.size > theta.size:
         return theta, residual, np.ones(theta.size)

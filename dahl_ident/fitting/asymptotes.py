@@ -1,6 +1,6 @@
 r"""Optima at infinity, to which a search tends if the data do not determine a parameter.
 
-A law has limits with fewer parameters. Dahl's law, for instance, declares
+A law has limits with fewer parameters. The limits of Dahl's law are
 
 ==================  ===============================  =====================  =====================
 limit               Z of the element                 runs away              determined
@@ -13,14 +13,14 @@ sharp knee          elastic, then f_max              alpha to 0             f_ma
 no full slip        dF/dx = sigma exp(-s F/phi)      f_max, alpha           phi = f_max/alpha, sigma
 ==================  ===============================  =====================  =====================
 
-and any law may vanish. For a law that declares none, every direction with a unit
+and the friction may vanish. For a law that declares no limits, every direction with a unit
 (:mod:`dahl_ident.fitting.directions`) is tried far out on either side of the data.
 
-The best fit may be at such a limit, and a search would then return the arbitrary large number at
-which it stopped. A limit is searched as a separate problem, in a **chart**: coordinates phi that
-stay finite, mapped to a theta so far out that the model agrees with its limit to five digits or
-more (three for no full slip). If the sum of squares there is not higher than at any finite optimum,
-the limit is the optimum, and phi gives the determined quantities and their covariance.
+If the best fit is at such a limit, a search returns the arbitrary large number at which it stops.
+A limit is therefore searched as a separate problem, in a **chart**: coordinates phi that stay
+finite, mapped to a theta so far out that the model agrees with its limit to five digits or more
+(three for no full slip). If the sum of squares there is not higher than at any finite optimum, the
+limit is the optimum, and phi gives the determined quantities and their covariance.
 
 In microslip with a free spring the cost has a long curved valley even if its minimum is finite. The
 chart (kappa, x_c, sigma + stiffness) straightens it; if f_max is given, the chart
@@ -45,19 +45,19 @@ from dahl_ident.problem import TableProblem
 _NO_FRICTION = 1e-18
 # ln of the scale of friction over that of the data, below which friction is negligible
 _LEAST_FRICTION = -60.0
-# range of directions with a unit in a search: factors of the smallest and the largest of their
-# sizes in the data; beyond, the curve agrees with its limit to all digits
+# range of directions with a unit in a search: factors of their smallest and largest sizes in the
+# data; beyond it, the curve agrees with its limit to all digits
 _EDGES = (1e-14, 1e8)
-# the upper factor if microslip is a limit: spring and friction already differ by rounding only
+# the upper factor if microslip is a limit: spring and friction are then equal except for rounding
 _TIED_EDGE = 1e4
-_FASTEST = 1e4  # range of rates of either sign in a search, times 1/(smallest amplitude)
-# range of numbers in a search: factors of the least and the largest number from which it starts
+_FASTEST = 1e4  # largest rate of either sign in a search, times the smallest amplitude
+# range of numbers in a search: factors of the smallest and the largest start
 _NUMBERS = (1.0 / 250.0, 25.0)
 # lengths in a limit: factors of the largest amplitude, and below the smallest; in slip, the
 # remaining stiffness of a law decreases only with the square root of the length
 _LIMIT_LENGTHS = (1e9, 1e14)
 # weight of determined combinations over that of single coordinates, to find phi from theta
-_FIRMLY = 1e3
+_COMBINATION_WEIGHT = 1e3
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Limit:
     """The behaviour of the element in this limit, if the status does not state it."""
     chart: Chart
     extremes: dict[str, float]
-    """Values of the parameters that run away."""
+    """Values, 0 or infinite, of the parameters that run away."""
     kept: tuple[tuple[str, FloatArray], ...] = ()
     """Determined combinations: expression, and the powers of theta's parameters in it."""
 
@@ -149,9 +149,10 @@ class Limit:
     def spread(
         self, slopes: FloatArray, inner: FloatArray, lost: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
-        """Return the covariance of theta, and which parameters are undetermined, from those of phi.
+        """Return the covariance of theta, and which parameters are undetermined.
 
-        `slopes` is dtheta/dphi, (P, Q); `inner` and `lost` are the covariance and that of phi.
+        `slopes` is dtheta/dphi, (P, Q); `inner` is the covariance of phi, and `lost` says which
+        elements of phi are undetermined.
         """
         covariance = slopes @ np.where(np.isfinite(inner), inner, 0.0) @ slopes.T
         undetermined = np.array([name in self.extremes for name in self.names])
@@ -196,10 +197,9 @@ class Reach:
                 least += [np.asarray(low - offset), np.asarray(offset - high)]
             if axes.is_free and axes.reference is not None and axes.reference.positive:
                 scale = Direction(axes.reference, None, axes.reference.dimension)
-                (row, offset) = scale.row(problem)
-                softest = scale.sizes(view)
+                row, offset = scale.row(problem)
                 rows.append(row)
-                least.append(softest.min(axis=-1) + _LEAST_FRICTION - offset)
+                least.append(scale.sizes(view).min(axis=-1) + _LEAST_FRICTION - offset)
         self._rows = np.array(rows).reshape(-1, P).T
         self._least = np.stack(np.broadcast_arrays(*least), axis=-1) if least else np.empty(0)
 
@@ -221,10 +221,10 @@ def _tying(element: Element) -> Asymptote | None:
 
 
 def microslip_charts(problem: TableProblem, *, scale_given: bool = False) -> list[Chart]:
-    """Return the straightened charts of microslip: each free law that ties a free spring.
+    """Return the charts that straighten the valley of microslip: one per law and free spring.
 
-    Their coordinates replace those of theta: the determined combination, the logarithm of the ratio
-    that runs away, and the sum with the spring. With `scale_given`, the charts are those of laws
+    Their coordinates are the determined combination, the logarithm of the ratio that tends to
+    infinity, and the sum of sigma and the spring. With `scale_given`, the charts are those of laws
     whose other scale parameter is given: ln sigma, and the sum.
     """
     charts = []
@@ -252,7 +252,7 @@ def microslip_charts(problem: TableProblem, *, scale_given: bool = False) -> lis
 def limits(problem: TableProblem) -> list[Limit]:
     """Return the limits of every law with a free parameter.
 
-    There is none with an unknown displacement gain, which could compensate any amplitude.
+    There are none if the displacement gain is unknown, because it could compensate any amplitude.
     """
     if "displacement_gain" in problem.names and "displacement_gain" not in problem.priors:
         return []
@@ -278,7 +278,7 @@ def _limits_of(
 ) -> list[Limit]:
     """Return the limits of an asymptote: one for each free spring if it adds to a spring.
 
-    There is none if a parameter that it pins, or that runs away, is not free.
+    There are none if a parameter that it pins, or that runs away, is not free.
     """
     free = {label for label, p in zip(element.labels, element.parameters, strict=True) if p.free}
     if not {*asymptote.pinned, *asymptote.runs_away} <= free:
@@ -417,5 +417,5 @@ def _chart(
     columns = matrix.T.copy()
     if follow is not None:
         matrix[names.index(follow[0])] = matrix[names.index(follow[1])]
-    rows = np.vstack([_FIRMLY * np.reshape(kept, (-1, len(names))), columns])
+    rows = np.vstack([_COMBINATION_WEIGHT * np.reshape(kept, (-1, len(names))), columns])
     return Chart(matrix, offset, np.linalg.pinv(rows @ matrix) @ rows)

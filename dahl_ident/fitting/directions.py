@@ -11,7 +11,8 @@ with its limit to well below any noise; :mod:`dahl_ident.fitting.asymptotes` dec
 optimum lies at infinity. A pure number takes the values that its law declares.
 
 If lengths scale the curve of a rate-independent law, the curve is read from tables over
-ln(A/length) whose steps divide those of the grid. Several lengths are multiples of the shortest.
+ln(A/length) whose steps divide those of the grid. If there are several lengths, they are tried as
+multiples of the shortest.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ _AROUND_KNEE = 1e3  # ratio to the knee beyond which a curve is a power law
 _START_NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
 LARGEST_STIFFNESS = 1e150  # weighted stiffness whose square is still a number
 _MULTIPLES = (1.0, 2.5, 10.0, 100.0)  # several lengths are tried at these times the shortest one
-_MOST_TABLES = 64  # tables kept: 6 MB a harmonic in all, and some seconds to compute
+_MOST_TABLES = 64  # tables kept: 6 MB for each harmonic, and some seconds to compute
 _LEAST_AMPLITUDES = 4  # amplitudes of a table, for cubic interpolation
 _AMPLITUDES_AT_ONCE = 20  # amplitudes computed in one call, until the law overflows
-_MOST_OF_ONE = 1000  # nodes of one element whose curves are computed node by node
+_MOST_NODES = 1000  # nodes of an element whose curves are computed node by node
 _MOST_LOOPS = 10_000  # loops integrated for a rate-dependent law: a second or two
 
 
@@ -73,7 +74,7 @@ class Direction:
         return not any(self.dimension)
 
     def row(self, problem: TableProblem) -> tuple[FloatArray, float]:
-        """Return row and offset with which its logarithm is row @ theta + offset."""
+        """Return the row and offset such that its logarithm is row @ theta + offset."""
         row = np.zeros(len(problem.parameters))
         offset = 0.0
         for parameter, sign in ((self.parameter, 1.0), (self.over, -1.0)):
@@ -107,7 +108,7 @@ class Directions:
     scale: tuple[Parameter, ...]
     """Parameters that scale the remaining force together."""
     reference: Parameter | None
-    """The parameter of `scale` by which the others are divided."""
+    """The parameter in `scale` by which the others are divided."""
     nonlinear: tuple[Direction, ...]
 
     @property
@@ -287,22 +288,24 @@ def columns_of(
 
 
 def curves_at_nodes(d: Directions, view: StiffnessData, most: float) -> NodeCurves:
-    """Return an element at the nodes of its grid, of which there are at most about `most`."""
+    """Return an element at the nodes of its grid, about `most` at most."""
     if not d.nonlinear:
         fixed, columns = columns_of(d, {}, view)
         columns = [replace(c, curve=_at_one_node(c.curve, view)) for c in columns]
         return NodeCurves({}, columns, None if fixed is None else _at_one_node(fixed, view), [])
     if d.lengths:
         return _tabulated_curves(d, view, most)
-    most = min(most, _MOST_OF_ONE)
+    most = min(most, _MOST_NODES)
     if needs_loops(d):
         most = min(most, _MOST_LOOPS / view.harmonic.size)
     lengths = [x for x in d.nonlinear if not x.is_number]
-    numbers = [_numbers(x) for x in d.nonlinear if x.is_number]
-    combined = float(np.prod([n.size for n in numbers])) if numbers else 1.0
-    per_length = max(12.0, (most / combined) ** (1.0 / max(1, len(lengths))))
-    axes = [_axis(x, view, per_length) for x in lengths] + [n[None] for n in numbers]
-    ordered = lengths + [x for x in d.nonlinear if x.is_number]
+    numbers = [x for x in d.nonlinear if x.is_number]
+    ordered = lengths + numbers
+    nodes_of_numbers = [_numbers(x) for x in numbers]
+    combinations = float(np.prod([nodes.size for nodes in nodes_of_numbers]))
+    per_length = max(12.0, (most / combinations) ** (1.0 / max(1, len(lengths))))
+    axes = [_axis(x, view, per_length) for x in lengths]
+    axes += [nodes[None] for nodes in nodes_of_numbers]
     counts = [a.shape[-1] for a in axes]
     if np.prod(counts) <= 2.0 * most:
         index = np.indices(counts).reshape(len(counts), -1)
@@ -334,7 +337,7 @@ def _at_one_node(curve: ComplexArray, view: StiffnessData) -> ComplexArray:
 def _possible(
     d: Directions, ordered: list[Direction], axes: list[FloatArray], index: IntArray
 ) -> BoolArray:
-    """Return the nodes where an element is physically possible, or all if it is nowhere."""
+    """Return the nodes where an element is physically possible; all nodes if there are none."""
     names = [x.parameter.name for x in ordered]
     possible = []
     for node in index.T:
@@ -347,7 +350,7 @@ def _possible(
 
 
 def _numbers(direction: Direction) -> FloatArray:
-    """Return the values of a pure number that are nodes."""
+    """Return the nodes of a pure number."""
     p = direction.parameter
     values = np.array(p.scan or _START_NUMBERS[p.transform])
     if not p.scan and np.isfinite([p.lower, p.upper]).all() and not p.positive:
@@ -357,7 +360,7 @@ def _numbers(direction: Direction) -> FloatArray:
 
 
 def _axis(direction: Direction, view: StiffnessData, most: float) -> FloatArray:
-    """Return the values of a direction with a unit that are nodes, (..., K)."""
+    """Return the nodes of a direction with a unit, (..., K)."""
     position = np.rint(direction.sizes(view) / _LOG_STEP).astype(np.intp)
     low = position.min(axis=-1)
     span = int((position.max(axis=-1) - low).max())
@@ -520,7 +523,7 @@ def _computed_table(
 def _interpolated(Z: ComplexArray, position: FloatArray) -> ComplexArray:
     """Return columns of (K, n) at positions from 0 to n - 1, by cubics through the four nearest.
 
-    Splines of scipy take longer to import than a small fit takes.
+    The splines of scipy are not used: importing them takes longer than a small fit.
     """
     first = np.clip(position.astype(np.intp) - 1, 0, Z.shape[1] - 4)
     u = position - first

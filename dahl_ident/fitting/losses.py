@@ -1,19 +1,19 @@
 """Robust losses, which down-weight rows far from the model.
 
-A row of a table has two residuals, real and imaginary part or ln gain and phase; it counts as
-rho(z), with z the sum of their squares over the noise variance, in place of z itself. A point is an
-outlier as a whole, whichever way the coordinates are turned. A sample of a record has one. Near the
-model rho(z) = z.
+A row of a table has two residuals, real and imaginary part or ln gain and phase; a sample of a
+record has one. With z the sum of their squares over the noise variance, a row counts as rho(z)
+instead of z: proportional to z near the model, and less far from it. So a row is an outlier as a
+whole, independently of the coordinates in which its residuals are stated.
 
 - ``huber``: z up to 1.345^2, then growing with |y|;
 - ``soft_l1``: 2 (sqrt(1 + z) - 1), similar and smooth;
 - ``student_t``: (4 + p) ln(1 + z/4), for p residuals a row: the likelihood of Student's t with 4
-  degrees of freedom; distant points lose their influence altogether.
+  degrees of freedom; points far from the model have almost no influence.
 
-**Scale.** Where the noise's scale s is unknown it has to be robust as well: mean chi(z) = E[chi(z)]
-with E taken for Gaussian noise and z in units of s^2 (p n - P)/(p n), so that s^2 is the noise's
-variance when there are no outliers. chi = psi^2 = rho'(z)^2 z is Huber's proposal 2; for student_t,
-whose psi^2 decreases for large z, chi = rho'(z) z, the scale equation of its likelihood.
+**Scale.** An unknown scale s of the noise has to be robust as well: mean chi(z) = E[chi(z)], with E
+the expectation for Gaussian noise and z in units of s^2 (p n - P)/(p n), so that s^2 is the
+variance of the noise if there are no outliers. chi = psi^2 = rho'(z)^2 z is Huber's proposal 2; for
+student_t, whose psi^2 decreases for large z, chi = rho'(z) z, the scale equation of its likelihood.
 
 **Likelihood**: that of the density proportional to exp(-rho/2), at the likeliest scale.
 
@@ -36,9 +36,9 @@ from dahl_ident.errors import ValidationError, choices
 # residual, in standard deviations, beyond which Huber's loss grows linearly: 95 % efficient for
 # Gaussian noise (Huber)
 KNEE = 1.345
-TAIL_DOF = 4.0  # degrees of freedom of Student's t: tails of outliers, yet a finite variance
-_SCALINGS = 1000  # most steps to the likeliest scale, each of which is cheap
-_SAME_SCALE = 1e-12  # relative change of the variance at which they end
+TAIL_DOF = 4.0  # degrees of freedom of Student's t: heavy tails, but a finite variance
+_SCALE_STEPS = 1000  # most steps to the likeliest scale, each of which is cheap
+_SAME_SCALE = 1e-12  # relative change of the variance at which the steps end
 
 
 @dataclass(frozen=True)
@@ -69,16 +69,17 @@ class Loss:
         return float(weights @ self.chi(2.0 * nodes) / weights.sum())
 
     def scores(self, y: FloatArray) -> FloatArray:
-        """Return residuals (m,) with which least squares gives the estimate of the loss.
+        """Return residuals (m,) for which least squares gives the same estimate as the loss.
 
-        They are psi(y)/mean(psi'), y in units of the noise: their scatter gives its covariance,
-        and a change of y changes them by as much on average. Source: Huber, section 7.10.
+        They are psi(y)/mean(psi'), with y in units of the noise. Their scatter gives the covariance
+        of the estimate, and a change of y changes them on average by the same amount. Source:
+        Huber, section 7.10.
         """
         z = np.sum(y.reshape(-1, self.parts) ** 2, axis=1)
         return y * np.repeat(self.slope(z) / self.mean_slope(z), self.parts)
 
     def counts(self, z: FloatArray, dof: float) -> FloatArray:
-        """Return each square's weight in the scale; for noise alone weighted squares sum to dof."""
+        """Return the weights of squares for the scale; of noise alone, they sum `z` to `dof`."""
         weight = self.slope(z * (self.parts * z.size / dof)) ** self.power
         return weight * (self.parts / self.gaussian_chi)
 
@@ -98,9 +99,9 @@ class Loss:
         return float(np.log(quad(density, 0.0, np.inf)[0] / gaussian))
 
     def likeliest(self, z: FloatArray, least: float) -> float:
-        """Return s^2 at which squares s^2 `z` are likeliest under exp(-rho/2), from `least` on."""
+        """Return the likeliest s^2 >= `least` for squares `z` with a density exp(-rho(z/s^2)/2)."""
         s2 = 1.0
-        for _ in range(_SCALINGS):
+        for _ in range(_SCALE_STEPS):
             factor = float(np.mean(self.slope(z / s2) * z / s2)) / self.parts
             s2 = max(s2 * factor, least)
             if s2 == least or abs(factor - 1.0) < _SAME_SCALE:
@@ -156,10 +157,10 @@ LOSSES = {
 
 
 def loss_named(name: str, parts: int = 2) -> Loss | None:
-    """Return the loss called `name` for rows of so many residuals, None for "linear"."""
+    """Return the loss called `name` for rows of `parts` residuals, None for "linear"."""
     if name == "linear":
         return None
-    if name not in list(LOSSES):  # a list also takes what has no hash
+    if name not in list(LOSSES):  # a list may be asked for objects without a hash
         raise ValidationError(f"loss is {name!r}; expected {choices(['linear', *LOSSES], name)}")
     loss = _student_t(parts) if name == "student_t" else LOSSES[name]
     return replace(loss, parts=parts)

@@ -1,4 +1,4 @@
-"""A plan: levels in the order of the run, predicted uncertainties, and limits that prevent more."""
+"""A plan: levels in the order of the run, predicted uncertainties, and the limits that matter."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
-_NEARLY = 0.99  # fraction of the longest time that counts as all of it, because cycles are whole
-_RELAXED = 10.0  # factor by which a limit is widened to find its effect
+_NEARLY_ALL = 0.99  # fraction of the longest time that counts as all of it, as cycles are whole
+_WIDER = 10.0  # factor by which a limit is widened to find its effect
 _MODEL_ERROR = {
     "none": "the model is right",
     "estimated": "the model errs as the earlier data show",
@@ -49,11 +49,11 @@ class PlanStep:
     """One level of a run, or one motion in time."""
 
     level: float  # amplitude of displacement (m) or drive (N), zero to peak
-    frequency_hz: float  # hz; one over the period of a motion
-    settling_cycles: int  # cycles before measuring
-    measured_cycles: int  # of a motion, its repeats
+    frequency_hz: float  # of a motion in time, 1/period
+    settling_cycles: int  # before measuring
+    measured_cycles: int  # of a motion in time, the number of repeats
     seconds: float  # change-over, settling and measuring
-    motion: PlannedMotion | None = None  # the motion in time that is repeated, None for a sine
+    motion: PlannedMotion | None = None  # the motion in time; None for a sine
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,11 @@ class Plan:
     seconds : float
         Total time.
     expected : mapping of str to Expected
-        Predicted uncertainty of every parameter and target; the ranges are not used.
+        Predicted uncertainty of every parameter and target, without the information in `ranges`.
     target : mapping of str to float
         Relative uncertainties that were asked for; empty if time was given.
     reached : bool
-        Whether all targets, and those of suspected parameters, are predicted to be reached.
+        Whether the plan is predicted to meet all targets, those of suspected parameters included.
     undetermined : tuple of str
         Quantities that the plan does not determine, and the limit that prevents it.
     assumptions : tuple of str
@@ -108,7 +108,7 @@ class Plan:
     def to_frame(self) -> pd.DataFrame:
         """Return the table: level, frequency, settling and measured cycles, seconds.
 
-        Of motions in time: the motion, its parameters, period, repeats and seconds.
+        For motions in time: the motion, its parameters, period, repeats and seconds.
 
         Returns
         -------
@@ -152,7 +152,7 @@ class Plan:
         Raises
         ------
         ValidationError
-            If the plan is one of motions in time; `write_waveform` writes them.
+            If the plan holds motions in time; `write_waveform` writes them.
         """
         if self.steps[0].motion is not None:
             raise ValidationError("the plan holds motions in time; write_waveform() writes them")
@@ -314,7 +314,9 @@ class Plan:
             )
             for name, e in self.expected.items()
         ]
-        expanded = any(map(is_expanded, self.expected))
+        legend = "Relative standard uncertainties"
+        if any(map(is_expanded, self.expected)):
+            legend += "; U(...) expanded, 95.45 %"
         return "\n".join(
             [
                 f"{head} in {self.seconds:.4g} s{end if self.target else ''}.",
@@ -322,7 +324,7 @@ class Plan:
                 self._table(),
                 "",
                 table([("", "value", "before", "after", "wanted"), *rows]),
-                "Relative standard uncertainties" + "; U(...) expanded, 95.45 %" * expanded + ".",
+                f"{legend}.",
                 *(f"{text}." for text in self.undetermined),
                 *self._spare(),
                 f"Assumed: {'; '.join(self.assumptions)}.",
@@ -348,7 +350,8 @@ class Plan:
         """Return the steps as text, one line each."""
         rows = [_row(step) for step in self.steps]
         last = ("period", "repeats", "seconds")
-        names = sorted(dict.fromkeys(n for row in rows for n in row), key=last.__contains__)
+        names = list(dict.fromkeys(n for row in rows for n in row))
+        names = [n for n in names if n not in last] + [n for n in last if n in names]
         units = {**trajectories.UNITS, "level": "N" if self.controlled == "force" else "m"}
         headings = [
             f"{n.removesuffix('_hz').replace('_', ' ')} [{shown_unit(units[n], self.motion)}]"
@@ -382,28 +385,27 @@ def _row(step: PlanStep) -> dict[str, Any]:
     }
 
 
-def options_of(
+def candidates_within(
     question: PlanRequest,
     limits: BenchLimits,
     count: int = _FEW_LEVELS,
     lasting: float | None = None,
 ) -> Candidates:
     """Return the candidates within limits; motions are repeated for `lasting` s."""
-    q = question
-    if q.recorded is None:
-        return evaluate(q, limits, *grid(q, limits, count))
-    motions: Sequence[PlannedMotion] | str = q.motions
+    if question.recorded is None:
+        return evaluate(question, limits, *grid(question, limits, count))
+    motions: Sequence[PlannedMotion] | str = question.motions
     if isinstance(motions, str):
-        motions = motions_of(motions, limits, level_range(q, limits))
-    return evaluate_motions(q.knowledge, motions, limits, q.recorded, lasting)
+        motions = motions_of(motions, limits, level_range(question, limits))
+    return evaluate_motions(question.knowledge, motions, limits, question.recorded, lasting)
 
 
 def undetermined(
     search: Search, design: Design, expected: Mapping[str, Expected]
 ) -> tuple[str, ...]:
-    """Return a sentence for each undetermined quantity, with the limit that prevents it."""
+    """Return a sentence for each quantity that misses its target, with the limit that matters."""
     q = search.question
-    lost = {
+    missed = {
         name: f"{name} stays undetermined (standard uncertainty {_shown(e.after)})"
         for name, e in expected.items()
         if name not in (*q.target, *q.knowledge.assumed) and not e.after < _UNDETERMINED
@@ -411,11 +413,11 @@ def undetermined(
     for name, u in q.target.items() if q.has_numbers else ():
         if expected[name].after > 1.001 * u:
             what = "" if is_expanded(name) else "a standard uncertainty of "
-            lost[name] = f"{name} reaches {what}{_shown(expected[name].after)}, not {_shown(u)}"
+            missed[name] = f"{name} reaches {what}{_shown(expected[name].after)}, not {_shown(u)}"
     if q.suspects and search.suspect_ratio(design) > 1.0:
         names = ", ".join(q.suspects)
-        lost.setdefault(names, f"{names} is not seen as well as wanted")
-    sentences = [f"{text}; {_prevented_by(search, name)}" for name, text in lost.items()]
+        missed.setdefault(names, f"the uncertainty of {names} does not meet its target")
+    sentences = [f"{text}; {_prevented_by(search, name)}" for name, text in missed.items()]
     if not search.can_be_judged(design):
         sentences.append(
             "these levels are too few to tell a wrong model from noise, so that a fit to them "
@@ -425,18 +427,18 @@ def undetermined(
 
 
 def _prevented_by(search: Search, name: str) -> str:
-    """Return the limit that, ten times wider, would reduce an uncertainty most."""
+    """Return a statement on the limit that, ten times wider, would reduce an uncertainty most."""
     q, widened = search.question, {}
     if name not in search.forecast.directions:
         return "give more time or wider limits"
     base = _least_uncertainty(q, name, q.limits)
     for limit in q.limits.stated:
         low, high = getattr(q.limits, limit)
-        wider: dict[str, Any] = {limit: (low / _RELAXED, high * _RELAXED)}
+        wider: dict[str, Any] = {limit: (low / _WIDER, high * _WIDER)}
         with suppress(ValidationError):
             widened[limit] = _least_uncertainty(q, name, replace(q.limits, **wider))
     if np.isfinite(q.limits.time):
-        widened["time"] = base / np.sqrt(_RELAXED)
+        widened["time"] = base / np.sqrt(_WIDER)
     if not widened:
         return "no limit was stated that prevents it"
     best = min(widened, key=widened.__getitem__)
@@ -452,11 +454,12 @@ def _prevented_by(search: Search, name: str) -> str:
 
 def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits) -> float:
     """Return the uncertainty of a quantity with the best continuous design."""
-    options = options_of(question, limits)
-    few = Forecast.of(question, options).thinned()
+    candidates = candidates_within(question, limits)
+    few = Forecast.of(question, candidates).thinned()
     term = few.term({name: 1.0}, few.before + NOTHING * np.eye(few.before.shape[-1]))
     time = limits.time if np.isfinite(limits.time) else 1000.0
-    design = continuous_design(Objective((term,)), options.frequency_hz, time, tolerance=0.1)
+    frequency_hz = candidates.frequency_hz
+    design = continuous_design(Objective((term,)), frequency_hz, time, tolerance=0.1)
     return float(np.exp(-0.5 * design.value))
 
 
@@ -464,37 +467,37 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
     """Return the assumptions of the prediction."""
     q, known = search.question, search.question.knowledge
     force, length = (si_unit(kind, known.motion) for kind in ("force", "displacement"))
-    noise: tuple[str, ...]
+    texts = []
     if q.recorded is not None:
-        noise = (
+        texts.append(
             f"white noise of {q.recorded.noise:.3g} {force} in each sample of force, "
             f"{q.recorded.sample_rate:g} samples a second; a record of each motion is fitted "
-            "with its initial state, offset and drift",
+            "with its initial state, offset and drift"
         )
-        ranges = [f"{name} within the range that a fit assumes" for name in known.assumed]
+        texts += [f"{name} within the range that a fit assumes" for name in known.assumed]
     else:
-        noise = (
-            f"noise of one cycle: {percent(q.noise.relative, 3)} of the response"
-            + (f", {q.noise.force:.3g} {force}" if q.noise.force else "")
-            + (f", {q.noise.displacement:.3g} {length}" if q.noise.displacement else ""),
-            *["a row of the earlier data counts as one cycle"]
-            * (known.row_noise is not None and known.row_cycles == 1.0),
+        noise = f"noise of one cycle: {percent(q.noise.relative, 3)} of the response"
+        if q.noise.force:
+            noise += f", {q.noise.force:.3g} {force}"
+        if q.noise.displacement:
+            noise += f", {q.noise.displacement:.3g} {length}"
+        texts.append(noise)
+        if known.row_noise is not None and known.row_cycles == 1.0:
+            texts.append("a row of the earlier data counts as one cycle")
+        texts.append(
             f"scatter between runs: {percent(q.scatter, 3)}"
             if q.scatter
-            else "no scatter between runs",
+            else "no scatter between runs"
         )
-        ranges = [
-            f"{', '.join(known.assumed)} within the range that a fit assumes (fix it in the model "
-            "to plan without)"
-        ] * bool(known.assumed)
-    is_longest = design.seconds > _NEARLY * LONGEST and not np.isfinite(q.limits.time)
-    return (
-        *noise,
-        *ranges,
-        _MODEL_ERROR[search.forecast.model_error],
-        "calibrations are exact",
-        *["no plan takes more than 30 days unless a time is given"] * is_longest,
-    )
+        if known.assumed:
+            texts.append(
+                f"{', '.join(known.assumed)} within the range that a fit assumes (fix it in the "
+                "model to plan without)"
+            )
+    texts += [_MODEL_ERROR[search.forecast.model_error], "calibrations are exact"]
+    if design.seconds > _NEARLY_ALL * LONGEST and not np.isfinite(q.limits.time):
+        texts.append("no plan takes more than 30 days unless a time is given")
+    return tuple(texts)
 
 
 def _shown(u: float) -> str:

@@ -1,7 +1,7 @@
 """Information in the records of motions in time.
 
-A motion is a repeated period of displacement; one record holds all repeats and is fitted in time,
-so nothing has to settle. Its information is that of the record's fit
+A motion is a period of displacement that is repeated. One record holds all repeats and is fitted in
+time, so nothing has to settle. Its information is that of a fit of the record
 (:mod:`dahl_ident.problem.record_problem`): J'J/s^2 of the predicted force with white noise s, after
 elimination of the record's unknowns (state at the first sample, offset, drift).
 """
@@ -25,9 +25,9 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _PER_PERIOD = 400  # most samples at which derivatives are computed: integrals err by 1e-3
 _LEAST_SAMPLES = 16  # in a period, even if the sample rate is low
-_SIMULATED = 4  # repeats from rest, after which the friction force repeats as well
+_SIMULATED = 4  # repeats from rest, after which the friction force is periodic as well
 _FEW_REPEATS = 8  # repeats for which the search computes the information
-_LEVELS, _SPEEDS, _BANDS = 24, 4, 4  # of the candidates of each kind of motion
+_LEVELS, _SPEEDS, _BANDS = 24, 4, 4  # numbers of candidates for each kind of motion
 _SLOWER = 2.0  # factor from one speed or band to the next
 _LINES = 10  # highest over lowest frequency of a multisine
 
@@ -66,8 +66,8 @@ class RepeatSums:
     products: FloatArray
     parameters: int  # P
     period: float  # seconds
-    force: FloatArray  # (S,) largest, N
-    weight: float  # measured samples for each computed one, over the variance of the noise
+    force: FloatArray  # (S,) largest force, N
+    weight: float  # number of measured samples per computed one, over the variance of the noise
 
     @classmethod
     def of(cls, knowledge: Knowledge, motion: PlannedMotion, recorded: RecordedForce) -> RepeatSums:
@@ -92,12 +92,12 @@ class RepeatSums:
         return cls(np.array(products), P, motion.period, np.array(force), weight)
 
     def rows(self, repeats: int) -> FloatArray:
-        """Return J of a mean repeat in a record of `repeats`, (S, P, P), unknowns eliminated."""
+        """Return J of an average repeat in a record, (S, P, P), with the unknowns eliminated."""
         n, P = self.products.shape[-1], self.parameters
         total = np.zeros((len(self.products), n, n))
         for k in range(min(repeats, _SIMULATED)):
             shift = np.eye(n)
-            shift[-2, -1] = k * self.period  # drift = within the repeat + the time of its start
+            shift[-2, -1] = k * self.period  # drift from the start of the record
             total += shift.T @ self.products[:, k] @ shift
         later = np.arange(_SIMULATED, repeats) * self.period
         last, drift = self.products[:, -1], np.zeros((n, n))
@@ -121,9 +121,9 @@ def evaluate_motions(
     recorded: RecordedForce,
     lasting: float | None = None,
 ) -> Candidates:
-    """Return the candidates that all limits allow, with the information of a repeat.
+    """Return the candidates that all limits allow, with the information of an average repeat.
 
-    This is the mean over the repeats in a record of `lasting` s, by default over `_FEW_REPEATS`.
+    The average is over the repeats in a record of `lasting` s, by default over `_FEW_REPEATS`.
     """
     rate = recorded.sample_rate
     resolved = [motion for motion in motions if motion.fastest_hz * SAMPLES_PER_CYCLE <= rate]

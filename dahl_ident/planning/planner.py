@@ -21,7 +21,7 @@ from dahl_ident.planning.measurement_plan import (
     Plan,
     PlanStep,
     assumptions_of,
-    options_of,
+    candidates_within,
     undetermined,
 )
 from dahl_ident.planning.question import (
@@ -215,7 +215,7 @@ def plan(
         dict(suspects or {}),
     )
     if isinstance(candidates, int):
-        options = options_of(question, bench, whole_number(candidates, "candidates", 2))
+        options = candidates_within(question, bench, whole_number(candidates, "candidates", 2))
     else:
         pairs = non_negative_array(
             [list(cast("tuple[float, float]", p)) for p in candidates], "candidates"
@@ -232,8 +232,8 @@ def _of_motions(question: PlanRequest) -> Plan:
 
     This information depends on the number of repeats, because a record's unknowns take about one.
     """
-    lasting = Search(question, options_of(question, question.limits)).best().seconds
-    search = Search(question, options_of(question, question.limits, lasting=lasting))
+    lasting = Search(question, candidates_within(question, question.limits)).best().seconds
+    search = Search(question, candidates_within(question, question.limits, lasting=lasting))
     return _plan(search, search.best())
 
 

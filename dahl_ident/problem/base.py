@@ -1,4 +1,4 @@
-"""The interface of problems, of tables and of records, for every search, sampler and test."""
+"""The interface of problems, of tables and of records, that searches, samplers and tests use."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Problem(ABC):
     kind: ClassVar[str]
     """The kind of data: "table" or "records"."""
     kind_in_words: ClassVar[str]
-    """The kind of data as a sentence names it."""
+    """The kind of data, in words for a sentence."""
     refused_options: ClassVar[Mapping[str, str]]
-    """Options of estimates that such data do not take, and why."""
+    """Options of estimates that do not apply to such data, and why."""
     around_optimum: ClassVar[bool] = False
     """Whether a posterior is centred on the least-squares optimum, which then has to exist."""
     scaled_priors: ClassVar[bool] = False
@@ -64,13 +64,13 @@ class Problem(ABC):
     ranges: Mapping[str, tuple[float, float]] = {}
     """Mean and standard deviation of the logarithms of assumed parameters."""
     scale_known: bool = False
-    """Whether the residuals have unit variance as they are."""
+    """Whether the data state the noise, so that the residuals have unit variance."""
     has_misfit: bool = False
     """Whether covariances include a misfit in addition to the stated noise."""
     tail: Rho | None = None
     """The loss of rows whose covariance has few degrees of freedom; None if they are Gaussian."""
     n_simulations: int = 4999
-    """Number of simulated experiments: seven lie beyond either limit of the 99.73 % interval."""
+    """Number of simulated experiments: seven are beyond either limit of a 99.73 % interval."""
 
     @property
     def gaussian(self) -> bool:
@@ -123,7 +123,7 @@ class Problem(ABC):
 
     @abstractmethod
     def unit_sizes(self, dimension: Dimension) -> FloatArray:
-        """Return the sizes in the data of a unit with these powers of force, length and time."""
+        """Return the sizes in the data of a quantity with these powers of N, m and s."""
 
     @property
     @abstractmethod
@@ -279,8 +279,8 @@ class Problem(ABC):
         with respect to phi.
 
         The cost has shape () or (S,), and is infinite where there is no prediction. With a loss
-        rho(z) of each row, the gradient is exact, and the Hessian that of rho for a linear model,
-        rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
+        rho(z) of each row, the gradient is exact, and the Hessian is the one for a linear model,
+        rho' d' d + 2 rho'' (y' d)(y' d)', without its negative part.
         """
         rho = rho or self.tail
         m = self.n_residuals
@@ -340,9 +340,9 @@ class Problem(ABC):
 
         Priors are not included; the result is -inf where the model has no prediction. All noise
         models give densities of the same numbers, so their likelihoods can be compared. If a
-        covariance has few degrees of freedom, the result is a likelihood up to a constant: the loss
-        of :mod:`dahl_ident.noise` replaces the sum of squares. The filtered residuals of records
-        count as independent.
+        covariance has few degrees of freedom, the loss of :mod:`dahl_ident.noise` replaces the sum
+        of squares, and the result is a log-likelihood except for a constant. The filtered residuals
+        of records are taken as independent.
         """
         theta = self.space.checked(theta)
         if self.scale_known and scale is not None:

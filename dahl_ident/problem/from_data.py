@@ -38,7 +38,7 @@ def problem_class(data: object) -> type[TableProblem] | type[RecordProblem]:
 def refuse_options(
     problem: type[Problem], options: Mapping[str, Any], function: Callable[..., Any]
 ) -> None:
-    """Refuse options that such data do not take, unless they are at the function's defaults."""
+    """Refuse options that do not apply to such data, unless they have their defaults."""
     for name in changed_options(problem.refused_options, options, function):
         raise ValidationError(
             f"{argument(name).rstrip('=')} is given with {problem.kind_in_words}: "
@@ -49,7 +49,7 @@ def refuse_options(
 def changed_options(
     names: Iterable[str], options: Mapping[str, Any], function: Callable[..., Any]
 ) -> list[str]:
-    """Return the names of options, as far as there are any, that differ from their defaults."""
+    """Return which of the names are options with a value other than the function's default."""
     default = {name: p.default for name, p in signature(function).parameters.items()}
     return [n for n in names if n in options and not np.array_equal(options[n], default[n])]
 
@@ -66,7 +66,7 @@ def problem_of(
     output: Output | None = None,
     excitation: Excitation = "force",
 ) -> Any:
-    """Return the problem of a table, which may be a pandas one, of a record or of several."""
+    """Return the problem of a table, also as a pandas DataFrame, of one record or of several."""
     if problem_class(data) is TableProblem:
         table = data if isinstance(data, FrequencyResponse) else read_frequency_response(data)
         return TableProblem(
@@ -92,7 +92,7 @@ def problem_of(
 def without_copies(data: FrequencyResponse) -> FrequencyResponse:
     """Return a table without exact copies of other rows, which add no information.
 
-    Its provenance states their number.
+    Its provenance states the number of copies.
 
     Examples
     --------

@@ -5,13 +5,13 @@ factor g (see :mod:`dahl_ident.sensors`), all six quantities:
 
     R = (j omega)^p (g Z)^q,    q = 1 or -1,  p from -2 to 2.
 
-Rows whose displacement was controlled take the measured amplitude as A: an explicit model. Rows
-whose force was controlled take the measured drive u_0, and A solves A |Z(A, omega)| = u_0; its
-derivatives come from the implicit function theorem,
+For rows whose displacement was controlled, A is the measured amplitude. For rows whose force was
+controlled, A is the solution of A |Z(A, omega)| = u_0 with the measured drive u_0; its derivatives
+follow from the implicit function theorem,
 
     d ln A = (d ln u_0 - Re(dZ/Z)) / (1 + Re(A Z_A/Z)).
 
-The measured amplitude of such a row only serves to choose among several solutions.
+The measured amplitude of such a row is only used to choose among several solutions.
 
 That balance assumes a sinusoidal displacement. If the model has an equation of motion, rows whose
 force was controlled are predicted by the exact steady motion instead
@@ -65,11 +65,11 @@ class Prediction(NamedTuple):
 class NearbyPredictor:
     """The prediction near a point: the describing function, corrected to the exact motion.
 
-    The logarithm of the exact over the approximate response is linearized in the search coordinates
-    and in the logarithm of the drive. The error is of second order in the distance, and small,
-    because only the correction is linearized. A prediction costs as much as the describing
-    function. Harmonics of the displacement, which the describing function does not have, are
-    linearized themselves.
+    The correction, the logarithm of the exact over the approximate response, is linearized in the
+    search coordinates and in the logarithm of the drive. The error is of second order in the
+    distance, and small, because the describing function itself is not linearized. A prediction
+    costs as much as the describing function. Harmonics of the displacement, which the describing
+    function does not have, are linearized themselves.
     """
 
     def __init__(self, exact: Predictor, approximate: Predictor, theta: FloatArray) -> None:
@@ -121,7 +121,7 @@ class NearbyPredictor:
 
 @dataclass(frozen=True)
 class _Group:
-    """Rows that are computed together, with all their harmonics; `operator` is (j omega)^p."""
+    """Rows that are computed together; `operator` is (j omega)^p."""
 
     rows: slice | IntArray
     harmonic: NDArray[np.int64]
@@ -131,7 +131,7 @@ class _Group:
     amplitude: FloatArray
     drive: FloatArray | None
     steady: SteadyRows | None
-    """Steady motions of the rows, if these predict them."""
+    """Steady motions of the rows, if the rows are predicted by them."""
 
     @cached_property
     def orders(self) -> int | NDArray[np.int64]:
@@ -300,7 +300,7 @@ class Predictor:
         error: FloatArray | None,
         steady: SteadyRows | None = None,
     ) -> Prediction:
-        """Return R = (j omega)^p (g Y)^q, Y = Z of a sine, or u_0/X_k of the steady motion."""
+        """Return R = (j omega)^p (g Y)^q, with Y = Z, or u_0/X_k of the steady motion."""
         model_values, sensor_values = values[:-3], values[-3:]
         factor, power = group.operator, self._exponent
         if not self._exact_sensors:
@@ -341,7 +341,7 @@ class Predictor:
     ) -> StiffnessGradient:
         """Return Z by the describing function, and its derivatives.
 
-        They are with respect to ln A, or ln u_0 if the drive is held, and to the values.
+        They are with respect to ln A, or ln u_0 for force-controlled rows, and to the values.
         """
         forced, exists, drive = group.forced, np.ones((), dtype=np.bool_), None
         amplitude = group.amplitude if self._exact_sensors else group.amplitude / sensor_values[1]

@@ -49,12 +49,13 @@ class RecordProblem(RecordWaves):
     """Records of one device and a model: residuals, Jacobian and cost.
 
     Residuals are measured minus predicted samples over the standard deviation of the output, so
-    that their scale is unknown. Either each record is a run, or all are levels of one run. If the
-    model integrates, differentiates or has memory, a record is cut at its gaps into parts, each
-    with its first state; if it integrates or differentiates, unevenly sampled parts are resampled.
-    Both raise a warning. The predicted `output` is by default "motion" if the model has inertia,
-    otherwise "force". For the output "motion", `excitation` says what the records' force channel
-    is: a force, or the acceleration of the base, m/s^2, to which the motion is relative.
+    their scale is unknown. Either each record is a run, or all records are levels of one run. If
+    the model integrates, differentiates or has memory, a record is cut at its gaps into parts, each
+    with a first state of its own; if it integrates or differentiates, unevenly sampled parts are
+    resampled. Both are warned about. The predicted `output` is by default "motion" if the model has
+    inertia, otherwise "force". For the output "motion", `excitation` says what the force channel of
+    the records is: a force, or the acceleration of the base, m/s^2, to which the motion is
+    relative.
 
     Examples
     --------
@@ -112,7 +113,7 @@ class RecordProblem(RecordWaves):
         return self.like(records=parts)
 
     def for_records(self, records: Sequence[Record]) -> RecordProblem:
-        """Return the problem of other records, corrected for this one's delay and noise."""
+        """Return the problem of other records, with this one's corrections for delay and noise."""
         others = self.like(records=records).smoothed(on=self.is_smoothed).delayed(self.delay)
         return others.without_noise(self.displacement_noise)
 
@@ -165,7 +166,7 @@ class RecordProblem(RecordWaves):
         return self._with_free(self.model.with_parameters(fixed), {})
 
     def _with_free(self, model: Model, ranges: dict[str, tuple[float, float]]) -> RecordProblem:
-        """Return the same problem with a model of which other parameters are free."""
+        """Return the same problem with other free parameters in the model."""
         free = [p for p in model.parameters if p.free]
         parameters = (*free, *self.parameters[self.n_reported :])
         inside = np.array([p.name not in ranges for p in parameters])
@@ -234,9 +235,9 @@ class RecordProblem(RecordWaves):
 
     @cached_property
     def latest(self) -> dict[int, tuple[bytes, tuple[str, ...], Predicted]]:
-        """The last prediction of each record: values, and names of the differentiated parameters.
+        """The last prediction of each record, with its values and the names of its derivatives.
 
-        It is needed again, even by problems in which other parameters are free.
+        Problems with other free parameters use it as well.
         """
         return {}
 
@@ -260,7 +261,7 @@ class RecordProblem(RecordWaves):
         rho: Rho | None = None,
         chart: FloatArray | None = None,
     ) -> Quadratic:
-        """Return cost, gradient and Hessian, see ``Problem``; vanished values are held."""
+        """Return cost, gradient and Hessian, see ``Problem``; vanished values are held fixed."""
         if theta.ndim == 2:
             parts = [self.quadratic(row, scale, rho, chart) for row in theta]
             return Quadratic(*(np.stack(column) for column in zip(*parts, strict=True)))

@@ -1,6 +1,6 @@
-"""Reports as PDF on A4, by fpdf2, which is pure Python and installed by pip.
+"""Reports as PDF on A4 paper, written by fpdf2, which is pure Python and installed by pip.
 
-It uses the DejaVu fonts that are shipped with matplotlib, which have Greek letters and accents.
+The fonts are the DejaVu fonts shipped with matplotlib, which have Greek letters and accents.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _FONT = "DejaVu"
 _FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
-_HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; of a heading, and of the text kept below it
-_LONGEST = 60  # most letters of a title at the foot of a page
+_HEADING_HEIGHT, _KEPT_HEIGHT = 10.0, 28.0  # mm; of a heading, and of the text kept below it
+_LONGEST_TITLE = 60  # letters at the foot of a page
 _WHOLE = 20.0  # mm; paragraphs up to this height are not divided between pages
 _MARGIN = 16.0  # mm, of the pages
 _SIGNATURE = 26.0  # mm, height of the fields for date and signature
@@ -84,7 +84,7 @@ def pdf(document: Document) -> bytes:
             case TextTable() as table:
                 below = _beginning(page, table, _widths(page, table))
             case _:
-                below = _BEGINNING
+                below = _KEPT_HEIGHT
         _keep_together(page, _HEADING_HEIGHT + below)
         page.start_section(section.title)
         _heading(page, section.title, 2)
@@ -97,7 +97,9 @@ def pdf(document: Document) -> bytes:
 
 
 def _page(document: Document) -> FPDF:
-    title = document.title if len(document.title) <= _LONGEST else f"{document.title[:_LONGEST]}..."
+    title = document.title
+    if len(title) > _LONGEST_TITLE:
+        title = f"{title[:_LONGEST_TITLE]}..."
     identity = " \u00b7 ".join(text for text in (title, document.identity) if text)
 
     class Page(FPDF):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _LARGEST = 3  # number of sources of uncertainty on the first page
 _ASSUMED = "assumed; u counts it"
-_NO_PART = 1e-6  # negligible share of the variance: a thousandth of u
+_NEGLIGIBLE = 1e-6  # share of the variance: a thousandth of u
 _DIGITS = {"mcse": 2, "ess": 4, "r_hat": 5}
 _LINEARIZATION_ROWS = 9  # amplitudes, from the smallest to the largest
 
@@ -46,7 +46,7 @@ def answer(fit: FitResult) -> TextTable:
             verdict, reason = fit.verdict_on(name)
             lost = not verdict.known
             limit = limits[name]
-            # of an undetermined parameter, a single limit is valid, an interval is not
+            # for an undetermined parameter a one-sided limit is valid, a closed interval is not
             closed = lost and bool(np.isfinite([limit.lower, limit.upper]).all())
             text = interval(limit.lower, limit.upper, "")
             within = Cell(text, struck=not described or closed)
@@ -103,7 +103,7 @@ def budget(stated: Budget) -> TextTable:
         combined = ("combined", "-", p.u, p.dof, 1.0)
         for part in (combined, *(tuple(vars(row).values()) for row in p.rows)):
             source, kind, u, dof, share = part
-            if share > _NO_PART:
+            if share > _NEGLIGIBLE:
                 rows.append(
                     {
                         "parameter": p.name,
@@ -145,7 +145,7 @@ def priors_in_words(fit: FitResult) -> Iterator[tuple[str, str]]:
 
 
 def prior_text(prior: Any) -> str:
-    """Return bounds or a frozen distribution as typed by a user."""
+    """Return bounds or a frozen distribution as a user would type them."""
     if isinstance(prior, tuple):
         return ":".join(map(repr, prior))
     arguments = [*map(repr, prior.args), *(f"{k}={v!r}" for k, v in prior.kwds.items())]

@@ -29,12 +29,12 @@ class Change:
     before: str  # name of the earlier fit
     after: str
     change: float  # difference of the estimates
-    relative: float  # its share of the earlier one
-    # standard uncertainty: both combined ones, and for a fit of a single run the scatter between
-    # runs that the other one shows
+    relative: float  # the change over the earlier estimate
+    # standard uncertainty of the change: from both estimates and, for a fit of a single run, from
+    # the scatter between runs that the other fit shows
     u: float
-    runs_known: bool  # whether `u` holds the scatter between runs
-    p: float  # two-sided probability by chance; NaN where an estimate must not be used
+    runs_known: bool  # whether `u` includes the scatter between runs
+    p: float  # two-sided p-value of no change; NaN if an estimate must not be used
 
     @property
     def significant(self) -> bool:
@@ -57,7 +57,7 @@ class Change:
 
     @property
     def p_text(self) -> str:
-        """The probability as text, complete."""
+        """The probability as text, with its symbol."""
         if not math.isfinite(self.p):
             return "-"
         return f"p {self.p_number}" if self.p < 1e-4 else f"p = {self.p_number}"
@@ -78,7 +78,7 @@ class Change:
 
 
 def changes(fits: Mapping[str, FitResult]) -> list[Change]:
-    """Return the changes of every parameter that a fit and the one before it estimate."""
+    """Return the changes of every parameter that successive fits estimate."""
     return [
         _change(name, *earlier, *later)
         for earlier, later in pairwise(fits.items())
@@ -88,7 +88,7 @@ def changes(fits: Mapping[str, FitResult]) -> list[Change]:
 
 
 def headline(changed: list[Change]) -> list[str]:
-    """Return what changed in sentences, and what the comparison leaves open."""
+    """Return sentences on what has changed, and on what the comparison leaves open."""
     sentences = [f"{c}." for c in changed if math.isfinite(c.p) and c.p < SIGNIFICANT]
     if not sentences:
         return ["No parameter changes significantly between the measurements."]

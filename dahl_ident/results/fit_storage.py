@@ -1,8 +1,8 @@
 """Fits as JSON: data, model, noise, sensors and optimum.
 
-The file states its schema and version. It contains what does not change with the version of the
-package: table or records, the model as plain data, the estimate with its covariance. Residuals,
-intervals and verdicts are computed again by the version that loads the file.
+The file states its schema and version. It contains only what does not depend on the version of the
+package: table or records, the model as plain data, the estimate with its covariance. The version
+that loads the file computes residuals, intervals and verdicts again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dahl_ident.version import __version__
 
 _SCHEMAS = {"table": "dahl_ident.fit_result", "records": "dahl_ident.record_fit"}
 VERSION = 5  # version of the layout; any other is refused
-_SAME = 1e-6  # relative difference above that between versions of numerical libraries
+_SAME = 1e-6  # relative tolerance; versions of numerical libraries differ by less
 
 _TEXTS = ("level", "run", "controlled", "harmonic")  # labels, words and counts
 _SENSORS = ("force_gain", "displacement_gain", "delay")

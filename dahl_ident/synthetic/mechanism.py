@@ -128,7 +128,7 @@ def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equa
 
 
 class EngineMotion:
-    """The solution of equations of motion under a waveform, from rest, at any times within it."""
+    """The solution of equations of motion under a waveform, starting at rest, at any times."""
 
     def __init__(
         self,
@@ -140,7 +140,9 @@ class EngineMotion:
         damping: float | None = None,
     ) -> None:
         self._system = translate(equations)
-        self._damping = damping  # of a plant without mass, which follows a jump of the force
+        self._damping = (
+            damping  # of a plant without mass, in which a jump of the force acts at once
+        )
         self._values = np.array(values, dtype=np.float64)
         self._waveform = waveform
         self._first = [np.zeros(self._system.order)]  # the states at the start of each segment

@@ -109,7 +109,7 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
 
 
 def datasets_directory() -> Path:
-    """Return the folder of the data sets: in an installed package, or beside it in a checkout."""
+    """Return the folder of the data sets: in the installed package, or next to it in a checkout."""
     for folder in _FOLDERS:
         if folder.is_dir():
             return folder
