@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -84,7 +85,13 @@ class TestContinuousDesign:
 
     @pytest.mark.parametrize(
         "change",
-        [{}, {"starts": np.array([0, 1])}, {"targets": None}, {"targets": None, "departures": 1}],
+        [
+            {},
+            {"starts": np.array([0, 1])},
+            {"targets": None},
+            {"targets": None, "departures": 1},
+            {"between": np.diag([0.3, 0.0, 0.1])},
+        ],
     )
     def test_the_gradient_is_that_of_the_value(self, change):
         objective = _objective(3, 6, 3, targets=3, scatter=0.2)
@@ -351,6 +358,42 @@ class TestPlan:
         assert (one.runs, many.runs > 3) == (1, True)
         assert many.expected["sigma"].scatter_share > 0.5
         assert many.seconds <= 300.0
+
+    def test_friction_that_differs_from_day_to_day_is_measured_on_more_days(self):
+        A = np.geomspace(0.1, 10.0, 12) * X_C
+        days = [
+            FrequencyResponse(
+                np.ones(12),
+                di.Dahl(f_max, SIGMA).describing_function(A)
+                * np.exp(0.003 * np.random.default_rng(i).standard_normal((2, 12)).T @ [1, 1j]),
+                A,
+                run=[str(i)] * 12,
+            )
+            for i, f_max in enumerate((0.097, 0.1, 0.104))
+        ]
+        fit = di.fit(FrequencyResponse.concatenate(days), LINEAR)
+        one = di.plan(fit, limits={**KNEE, "time": 600.0}, target="f_max", runs=1, draws=20)
+        told = one.expected["f_max"]
+        # the mean of four days instead of three
+        assert told.after == pytest.approx(told.before * np.sqrt(3.0 / 4.0), rel=0.02)
+        assert told.scatter_share > 0.9
+        assert "% of f_max" in str(one)
+        plan = di.plan(fit, limits=KNEE, target={"f_max": 0.7 * told.before}, draws=20)
+        assert (plan.reached, plan.runs) == (True, 4)  # seven days: sqrt(3/7) = 0.65
+        alike = di.plan(fit, limits=KNEE, target={"f_max": 0.7 * told.before}, draws=20, scatter=0)
+        assert alike.runs == 1
+
+    def test_the_limit_that_makes_a_plan_long_is_named(self):
+        """In microslip a tenth of the amplitude takes a hundred times as long."""
+        plan = di.plan(
+            LINEAR, ranges=NEAR, noise=0.01, target={"f_max": 0.02}, draws=20,
+            limits={"displacement": 6e-3 * X_C, "frequency_hz": 1.0},
+        )  # fmt: skip
+        assert plan.reached
+        hours = re.match(r"1 level in \S+ s \((\S+) h\); meets the target", str(plan))[1]
+        assert float(hours) == pytest.approx(plan.seconds / 3600.0, rel=0.05)
+        share = re.search(r"limit of displacement costs the time.* in 1/(\d+) of it", str(plan))[1]
+        assert float(share) == pytest.approx(100.0, rel=0.2)
 
     def test_least_time_with_scatter_takes_as_few_runs_as_needed(self):
         # 2 % between runs leaves 1 % only with more than four

@@ -6,7 +6,8 @@ further parameters of each run with the prior information 1/s^2; after their eli
 
     S = M - B (C + I/s^2)^{-1} B'
 
-on the parameters, and R equal runs give R S. S is a concave function of the cycles (a Schur
+on the parameters. Parameters that differ from run to run with the covariance T leave (S^{-1} +
+T)^{-1} of it, and R equal runs give R times as much. S is a concave function of the cycles (a Schur
 complement), and every criterion here is the mean over draws of the logarithm of a concave,
 homogeneous function of the information, so that the search for the best design is a convex problem:
 
@@ -76,6 +77,7 @@ class Term:
     # (T,) first of the columns of each target, whose variances are added; None for one column each
     starts: IntArray | None = None
     weight: float = 1.0  # in the sum of the terms
+    between: FloatArray | None = None  # (P, P) covariance of the parameters between runs
     # number of the last parameters, departures, whose uncertainty is not part of the criterion
     departures: int = 0
 
@@ -86,11 +88,15 @@ class Term:
         total = (cycles[..., None, :] @ self.packed)[..., 0, :]
         M = total.reshape(*total.shape[:-1], S, Q, Q)
         identity = np.broadcast_to(np.eye(P), (*M.shape[:-2], P, P))
-        if Q == P:
+        if Q > P:
+            C = M[..., P:, P:] + np.eye(2) / self.scatter**2
+            lever = -M[..., :P, P:] @ np.linalg.inv(C)
+            M = M[..., :P, :P] + lever @ M[..., P:, :P]
+            identity = np.concatenate([identity, lever], axis=-1)
+        if self.between is None:
             return M, identity
-        C = M[..., P:, P:] + np.eye(2) / self.scatter**2
-        lever = -M[..., :P, P:] @ np.linalg.inv(C)
-        return M[..., :P, :P] + lever @ M[..., P:, :P], np.concatenate([identity, lever], axis=-1)
+        left = np.linalg.inv(np.eye(P) + M @ self.between)
+        return left @ M, left @ identity
 
     def at(self, cycles: FloatArray, runs: int) -> tuple[FloatArray, FloatArray]:
         """Return the weighted criterion, and its derivative with respect to the packed sums."""

@@ -61,6 +61,7 @@ class Forecast:
     scatter: float  # standard deviation of ln gain and phase between runs
     model_error: str  # {"none", "assumed", "estimated"} of the earlier fit
     departures: int  # number of departures, W
+    between: FloatArray | None = None  # (Q, Q) covariance of parameters between runs
 
     @classmethod
     def of(cls, question: PlanRequest, candidates: Candidates) -> Forecast:
@@ -74,7 +75,10 @@ class Forecast:
             model_error = "assumed" if error.assumed else "estimated"
             rows = np.concatenate([rows, error.columns * candidates.weight], axis=-1)
             known, searched = _joint(known, searched, error, units)
-        candidates = replace(candidates, rows=rows)
+        candidates, between = replace(candidates, rows=rows), None
+        if knowledge.between is not None:
+            scaled = knowledge.between / units**2
+            between = np.diag(np.pad(scaled, (0, known.shape[-1] - units.size)))
         directions, positive = {}, [p.positive for p in knowledge.parameters]
         for name in (*knowledge.names, *(n for n in question.target if n != RESPONSE)):
             change = np.zeros((len(known), known.shape[-1]))
@@ -92,7 +96,13 @@ class Forecast:
             question.scatter,
             model_error,
             departures=known.shape[-1] - units.size,
+            between=between,
         )
+
+    @property
+    def runs_differ(self) -> bool:
+        """Whether there is scatter between runs."""
+        return self.scatter > 0.0 or self.between is not None
 
     def thinned(self) -> Forecast:
         """Return the forecast at the few draws that a search averages over."""
@@ -112,17 +122,18 @@ class Forecast:
         c = self.candidates
         packed = packed_information(c.rows, c.offsets, self.scatter)
         known = self.searched if known is None else known
-        term = Term(packed, known, self.scatter, departures=self.departures)
+        term = Term(packed, known, self.scatter, between=self.between, departures=self.departures)
         if not target:
             return term
         columns = [self.directions[n] * least_factor(n) / u for n, u in target.items()]
         starts = np.cumsum([0, *(c.shape[-1] for c in columns[:-1])])
         return replace(term, targets=np.concatenate(columns, axis=-1), starts=starts)
 
-    def covariance(self, design: Design, scatter: float) -> FloatArray:
+    def covariance(self, design: Design) -> FloatArray:
         """Return the covariance of parameters and departures after a design, (S, Q, Q)."""
         c = self.candidates.only(design.levels)
-        term = Term(packed_information(c.rows, c.offsets, scatter), self.before, scatter)
+        packed = packed_information(c.rows, c.offsets, self.scatter)
+        term = Term(packed, self.before, self.scatter, between=self.between)
         return covariance_of(self.before + design.runs * term.of_run(design.cycles)[0])
 
     def uncertainty(self, covariance: FloatArray) -> dict[str, FloatArray]:
@@ -137,10 +148,11 @@ class Forecast:
 
         Expanded uncertainties have the coverage factor of the runs' degrees of freedom.
         """
-        after = self.uncertainty(self.covariance(design, self.scatter))
+        after = self.uncertainty(self.covariance(design))
         shares = dict.fromkeys(after, 0.0)
-        if self.scatter > 0.0:
-            by_noise = self.uncertainty(self.covariance(design, 0.0))
+        if self.runs_differ:
+            alike = replace(self, scatter=0.0, between=None)
+            by_noise = self.uncertainty(alike.covariance(design))
             for name, u in by_noise.items():
                 if np.isfinite(typical(after[name])):
                     shares[name] = max(0.0, 1.0 - (typical(u) / typical(after[name])) ** 2)

@@ -57,6 +57,7 @@ class Knowledge:
     row_cycles: float = 1.0  # cycles averaged in such a row, if the data state it
     problem: TableProblem | None = None  # of the earlier data
     scatter: float = 0.0  # standard deviation of ln gain and phase between runs in the earlier data
+    between: FloatArray | None = None  # (P,) variances of theta between runs, if there are any
     errors: ErrorModel | None = None  # of an earlier fit
     # standard deviation of a sample of force in earlier records, N
     sample_noise: float | None = None
@@ -163,6 +164,7 @@ def _of_table(
     errors: ErrorModel | None = source.errors if values is None else None
     model, assumed = _with_assumed(problem.model)
     centre, std = _moments(problem.parameters, ranges)
+    between: FloatArray | None = None
     if values is None:
         theta, optimum = np.array(source.optimum.theta, dtype=np.float64), source.optimum
         finite = np.isfinite(theta) & np.isfinite(optimum.values)
@@ -182,6 +184,8 @@ def _of_table(
         information = np.linalg.inv(errors.covariance)[part]
         stated, cycles = _row_noise(wider, 0.0)
         noise = float(np.hypot(stated, errors.rms(NOISE)))
+        differing = errors.between_runs[kept]
+        between = differing if differing.any() else None
     else:
         wider = problem.like(model=model) if assumed else problem
         parameters = wider.parameters
@@ -212,6 +216,7 @@ def _of_table(
         cycles,
         wider,
         0.0 if errors is None else errors.rms(RUNS),
+        between,
         errors,
         steady=problem.steady,
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number
 from dahl_ident.data.storage import place_of, plain_data, write_whole
-from dahl_ident.diagnostics.formatting import table
+from dahl_ident.diagnostics.formatting import listed, table
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
 from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_range
@@ -35,7 +35,10 @@ _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
 _NEARLY_ALL = 0.99  # fraction of the longest time that counts as all of it, as cycles are whole
+_HELPS = 1.25  # factor by which a wider limit reduces an uncertainty that it prevents
+_HOURS = 7200.0  # s, from which a duration is stated in hours as well
 _WIDER = 10.0  # factor by which a limit is widened to find its effect
+_COSTLY = _WIDER**0.75  # effect above that of the frequency or the time, its square root
 _MODEL_ERROR = {
     "none": "the model is right",
     "estimated": "the model errs as the earlier data show",
@@ -319,7 +322,7 @@ class Plan:
             legend += "; U(...) expanded, 95.45 %"
         return "\n".join(
             [
-                f"{head} in {self.seconds:.4g} s{end if self.target else ''}.",
+                f"{head} in {_duration(self.seconds)}{end if self.target else ''}.",
                 "",
                 self._table(),
                 "",
@@ -332,13 +335,21 @@ class Plan:
         )
 
     def _spare(self) -> list[str]:
-        """Return the gain if the remaining time is used, and how to use it."""
+        """Return the gain if the remaining time is used or a limit is wider, and how to use it."""
         time = self.search.question.limits.time
-        if not (self.reached and self.seconds < 0.5 * time < np.inf):
+        if self.reached and np.isinf(time):
+            found = {name: _widened(self.search, name) for name in self.target}
+            return [
+                f"The limit of {limit} costs the time: ten times wider, {name} would be as certain "
+                f"in 1/{gain**2:.2g} of it."
+                for name, (limit, gain) in found.items()
+                if gain > _COSTLY
+            ]
+        if not (self.reached and self.seconds < 0.5 * time):
             return []
         with_all = self.search.expected_after(time)
         gain = ", ".join(f"{name} {percent(with_all[name].after, 3)}" for name in self.target)
-        lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {gain}."]
+        lines = [f"{_duration(time - self.seconds)} are left; the whole time would give {gain}."]
         if self.runs == 1:
             lines.append(
                 f"Repeat the plan in {min(5, int(time // self.seconds))} runs, each a new "
@@ -364,6 +375,10 @@ class Plan:
             for i, row in enumerate(rows, start=1)
         ]
         return table([["", *headings], *lines])
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.4g} s" + f" ({seconds / 3600.0:.2g} h)" * (seconds >= _HOURS)
 
 
 def _cell(value: Any) -> str:
@@ -426,11 +441,9 @@ def undetermined(
     return tuple(sentences)
 
 
-def _prevented_by(search: Search, name: str) -> str:
-    """Return a statement on the limit that, ten times wider, would reduce an uncertainty most."""
-    q, widened = search.question, {}
-    if name not in search.forecast.directions:
-        return "give more time or wider limits"
+def _widened(search: Search, name: str) -> tuple[str, float]:
+    """Return the limit that, ten times wider, would reduce an uncertainty most, and how far."""
+    q, widened = search.question, {"": np.inf}
     base = _least_uncertainty(q, name, q.limits)
     for limit in q.limits.stated:
         low, high = getattr(q.limits, limit)
@@ -439,16 +452,23 @@ def _prevented_by(search: Search, name: str) -> str:
             widened[limit] = _least_uncertainty(q, name, replace(q.limits, **wider))
     if np.isfinite(q.limits.time):
         widened["time"] = base / np.sqrt(_WIDER)
-    if not widened:
-        return "no limit was stated that prevents it"
     best = min(widened, key=widened.__getitem__)
-    if not widened[best] < 0.8 * base:
+    return best.removesuffix("_hz"), base / widened[best]
+
+
+def _prevented_by(search: Search, name: str) -> str:
+    """Return the limit that prevents a smaller uncertainty."""
+    if name not in search.forecast.directions:
+        return "give more time or wider limits"
+    limit, gain = _widened(search, name)
+    if not limit:
+        return "no limit was stated that prevents it"
+    if not gain > _HELPS:
         if search.forecast.model_error == "estimated":
             return "no limit alone prevents it: use a model that describes the data better"
         return "no limit alone prevents it: reduce the noise, or fix a parameter"
     return (
-        f"the limit of {best.removesuffix('_hz')} prevents it: ten times wider, it would be "
-        f"{base / widened[best]:.2g} times smaller"
+        f"the limit of {limit} prevents it: ten times wider, it would be {gain:.2g} times smaller"
     )
 
 
@@ -468,6 +488,11 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
     q, known = search.question, search.question.knowledge
     force, length = (si_unit(kind, known.motion) for kind in ("force", "displacement"))
     texts = []
+    differing = [f"{percent(q.scatter, 3)} of gain and phase"] if q.scatter else []
+    if known.between is not None:
+        sizes = (np.sqrt(known.between) / known.units).tolist()
+        named = zip(known.names, sizes, strict=True)
+        differing += [f"{percent(size, 3)} of {name}" for name, size in named if size]
     if q.recorded is not None:
         texts.append(
             f"white noise of {q.recorded.noise:.3g} {force} in each sample of force, "
@@ -485,9 +510,7 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
         if known.row_noise is not None and known.row_cycles == 1.0:
             texts.append("a row of the earlier data counts as one cycle")
         texts.append(
-            f"scatter between runs: {percent(q.scatter, 3)}"
-            if q.scatter
-            else "no scatter between runs"
+            f"scatter between runs: {listed(differing)}" if differing else "no scatter between runs"
         )
         if known.assumed:
             texts.append(

@@ -190,7 +190,7 @@ def plan(
                 f"plan: {stated[0]} is planned with settled sines only; leave it out for motions "
                 "in time, or leave candidates out"
             )
-        thinned = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0)
+        thinned = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0, between=None)
         recorded = recorded_force(noise, sample_rate, knowledge)
         arguments = (thinned, bench, targets, has_numbers, costs)
         return _of_motions(PlanRequest(*arguments, recorded=recorded, motions=motions))
@@ -199,6 +199,8 @@ def plan(
             "plan: sample_rate is that of records of motions in time; leave it out for settled "
             f"sines, or give {argument('candidates', 'trapezoid', option='motion')}"
         )
+    if scatter is not None:
+        knowledge = replace(knowledge, between=None)
     if controlled == "force" and knowledge.steady == "exact":
         knowledge = knowledge.thinned(SEARCHED)
     question = PlanRequest(
