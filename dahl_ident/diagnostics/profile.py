@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -219,7 +218,7 @@ class Profiler:
             starts.append(np.where(held, starts[0], edge))
             rows.append(rows[0])
         for chart in self._microslip_charts:
-            valley, applies = _along_valley(chart, index, theta, change, self._reach.smallest)
+            valley, applies = _along_valley(chart, index, theta, change, self._smallest)
             starts.append(valley[applies])
             rows.append(np.flatnonzero(applies))
         row = np.concatenate(rows)
@@ -233,7 +232,7 @@ class Profiler:
             f_max, sigma = _friction_of(chart)
             if max(sd[f_max], sd[sigma]) > DOUBTFUL:
                 edges = edge_starts(self._problem)
-                starts += [e for e in edges if e[f_max] - e[sigma] < self._reach.smallest]
+                starts += [e for e in edges if e[f_max] - e[sigma] < self._smallest]
         return starts
 
     @cached_property
@@ -382,9 +381,9 @@ class Profiler:
             of_friction = np.isin(np.array(self._problem.names)[index], (f_max.name, sigma.name))
             ln_f_max, ln_sigma = (np.asarray(columns.get(p.name, _ln(p))) for p in (f_max, sigma))
             ln_x_c = ln_f_max - ln_sigma
-            reach = self._reach
-            matters = (ln_x_c > reach.least) & (ln_x_c < reach.most) & (ln_sigma > reach.softest)
-            cancels = (ln_sigma > reach.stiffest) & (ln_x_c > reach.smallest)
+            least, most, softest, stiffest = self._reach
+            matters = (ln_x_c > least) & (ln_x_c < most) & (ln_sigma > softest)
+            cancels = (ln_sigma > stiffest) & (ln_x_c > self._smallest)
             near &= ~of_friction | (matters & ~cancels)
         return near
 
@@ -400,14 +399,22 @@ class Profiler:
         return pairs
 
     @cached_property
-    def _reach(self) -> _Distances:
+    def _smallest(self) -> float:
+        """Logarithm of the smallest amplitude; an x_c above it is microslip."""
+        return float(np.log(self._problem.stiffness_data.amplitude.min()))
+
+    @cached_property
+    def _reach(self) -> FloatArray:
+        """Ends of ln x_c, then of ln sigma, beyond which friction is at a limit.
+
+        Friction stiffer than the last, in microslip, is almost cancelled by a negative spring.
+        """
         view = self._problem.stiffness_data
         stiffness = view.typical_stiffness
         has_spring = any(e.is_linear and e.holds_at_rest for e in self._problem.model.elements)
         low, high = view.amplitude.min(), view.amplitude.max()
         most = _MOST_X_C_WITH_SPRING if has_spring else _MOST_X_C
-        ends = low * _LEAST_X_C, high * most, low, stiffness * _SOFTEST, stiffness * _STIFFEST
-        return _Distances(*np.log(ends).tolist())
+        return np.log([low * _LEAST_X_C, high * most, stiffness * _SOFTEST, stiffness * _STIFFEST])
 
     @cached_property
     def _farthest(self) -> FloatArray:
@@ -416,20 +423,6 @@ class Profiler:
         logarithms = np.where(pure, _FARTHEST_RATIO, _FARTHEST_LOG)
         far = _FARTHEST_LINEAR * self._conditional + 2.0 * np.abs(self._optimum.theta)
         return np.where(self._logarithmic, logarithms, far)
-
-
-class _Distances(NamedTuple):
-    """Range of ln x_c and ln sigma outside of which friction is at a limit.
-
-    Friction stiffer than `stiffest`, with an x_c above the `smallest` amplitude, is almost
-    cancelled by a negative spring.
-    """
-
-    least: float
-    most: float
-    smallest: float
-    softest: float
-    stiffest: float
 
 
 @dataclass(frozen=True)

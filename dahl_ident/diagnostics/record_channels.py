@@ -17,8 +17,7 @@ from scipy import fft, special
 
 from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.contributions import CHANNELS, excess
-from dahl_ident.diagnostics.correlated_residuals import correlated, sandwich
-from dahl_ident.diagnostics.record_sources import LinearFit, Waves, by_delay
+from dahl_ident.diagnostics.record_sources import LinearFit, Waves, by_delay, correlated, sandwich
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import FitError
 from dahl_ident.problem.record_noise import LEADS, drive_noise

@@ -32,7 +32,6 @@ from dahl_ident.diagnostics.contributions import (
     satterthwaite,
     variances,
 )
-from dahl_ident.diagnostics.correlated_residuals import correlated, noise_in, sandwich
 from dahl_ident.diagnostics.record_channels import (
     DISPLACEMENT_GAIN,
     DRIVE,
@@ -49,7 +48,10 @@ from dahl_ident.diagnostics.record_sources import (
     LinearFit,
     between_records,
     blocks_of,
+    correlated,
     fixed_exponents,
+    noise_in,
+    sandwich,
 )
 from dahl_ident.elements import Friction
 from dahl_ident.elements.recursion import linear_recursion, stretches

@@ -1,8 +1,7 @@
 """Results for users: estimates with their verdicts, from one call."""
 
 from dahl_ident.results.estimate import fit, fit_many, posterior
-from dahl_ident.results.fit_batch import FitBatch
-from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.fit_result import FitBatch, FitResult
 from dahl_ident.results.posterior_result import Posterior
 from dahl_ident.results.result import Estimate
 

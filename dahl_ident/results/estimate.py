@@ -40,8 +40,7 @@ from dahl_ident.problem import (
     refuse_options,
 )
 from dahl_ident.progress import spinner
-from dahl_ident.results.fit_batch import FitBatch
-from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.fit_result import FitBatch, FitResult
 from dahl_ident.results.posterior_result import Posterior
 from dahl_ident.sensors import Sensors
 from dahl_ident.units import counted, percent
