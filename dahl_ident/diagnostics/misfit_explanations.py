@@ -216,14 +216,13 @@ def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimu
         return ""
     _, change, problem = min(promising, key=lambda candidate: candidate[0])
     after = misfit_of(solve(problem, loss=optimum.loss))
-    if not after * EXPLAINS < before:
-        return ""
     return _with_changed_sign(f"the response {change.name}", before, after, change.check)
 
 
 def _with_changed_sign(what: str, before: float, after: float, check: str) -> str:
     misfits = f"from {percent(before)} to {percent(after)} rms"
-    return f"With {what} the misfit falls {misfits}: {check}"
+    explains = after * EXPLAINS < before
+    return f"With {what} the misfit falls {misfits}: {check}" if explains else ""
 
 
 def force_convention(optimum: Optimum, before: float) -> str:
@@ -242,8 +241,6 @@ def force_convention(optimum: Optimum, before: float) -> str:
         return ""
     residuals = np.concatenate(changed.problem.split_residuals(changed.values))
     after = float(np.sqrt(np.mean(residuals**2))) / problem.output_std
-    if not after * EXPLAINS < before:
-        return ""
     return _with_changed_sign("the force negated", before, after, _SIGN)
 
 
