@@ -153,10 +153,9 @@ def test_a_report_shows_how_waveforms_settled(run):
 def test_levels_come_from_file_names(run):
     amplitude = np.geomspace(1e-4, 1e-2, 6)
     stiffness = di.Dahl(0.1, 30.0).describing_function(amplitude)
-    for level, A, N in zip(("0.1", "0.2", "0.3"), amplitude[::2], stiffness[::2], strict=True):
+    for level, N in zip(("0.1", "0.2", "0.3"), stiffness[::2], strict=True):
         text = f"frequency_hz,gain [N/m],phase_deg\n1,{abs(N)},{np.degrees(np.angle(N))}\n"
         Path(f"run_{level}mm.csv").write_text(text, encoding="utf-8")
-        assert A > 0.0
     outcome = run(
         "fit", "run_0.1mm.csv", "run_0.2mm.csv", "run_0.3mm.csv", "--json",
         "--level-from-name", "_([0-9.]+)mm", "--amplitude", "{level} mm",
@@ -318,16 +317,21 @@ def test_no_colour_off_a_terminal(run):
     assert "\x1b[" not in run("datasets").out + run("--no-color", "datasets").out
 
 
-@pytest.mark.versions
-def test_help_loads_nothing_heavy():
+def loaded_modules(*arguments):
+    """Return the modules that are loaded after a command."""
     code = (
         "import sys\nfrom dahl_ident.cli import main\n"
-        "try:\n    main(['fit', '--help'])\nexcept SystemExit:\n    pass\n"
+        f"try:\n    main({list(arguments)!r})\nexcept SystemExit:\n    pass\n"
         "print('loaded', *sys.modules)"
     )
     out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    loaded = set(out.stdout[out.stdout.rindex("loaded") :].split())
-    assert not loaded & {"numpy", "scipy", "matplotlib", "pandas", "casadi", "emcee", "pint"}
+    return set(out.stdout[out.stdout.rindex("loaded") :].split())
+
+
+@pytest.mark.versions
+def test_help_loads_nothing_heavy():
+    heavy = {"numpy", "scipy", "matplotlib", "pandas", "casadi", "emcee", "pint"}
+    assert not loaded_modules("fit", "--help") & heavy
 
 
 @pytest.mark.parametrize("extracted", [False, True])
@@ -343,15 +347,8 @@ def test_a_fit_of_a_small_table_loads_nothing_that_takes_long(tmp_path, *, extra
     again = di.read_frequency_response(table)
     for name in again.quality:
         assert np.array_equal(again.quality[name], data.quality[name])
-    code = (
-        "import sys\nfrom dahl_ident.cli import main\n"
-        f"try:\n    main(['fit', {str(table)!r}, '-q'])\nexcept SystemExit:\n    pass\n"
-        "print('loaded', *sys.modules)"
-    )
-    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    loaded = set(out.stdout.split())
     heavy = {"matplotlib", "pandas", "casadi", "emcee", "pint", "scipy.stats", "control", "h5py"}
-    assert loaded & (heavy | {"scipy.interpolate"}) == set()
+    assert loaded_modules("fit", str(table), "-q") & (heavy | {"scipy.interpolate"}) == set()
 
 
 def test_a_saved_fit_is_reported_with_its_posterior(run):
@@ -507,27 +504,25 @@ def test_lists_keep_to_a_narrow_terminal(run, monkeypatch):
 
 
 WRITING = {
-    "datasets": ("noisy", "-o", "there.csv"),
-    "simulate": ("--f-max", "0.1", "--sigma", "30", "-o", "there.csv"),
-    "extract": ("-", "--plot", "there.png"),
-    "fit": ("-", "--save", "there.json"),
-    "report": ("-", "-o", "new.json", "-o", "there.html"),
-    "sample": ("-", "--steps", "20", "--report", "there.json"),
-    "demo": ("-o", "."),
+    "datasets": ("there.csv", ("noisy", "-o", "there.csv")),
+    "simulate": ("there.csv", ("--f-max", "0.1", "--sigma", "30", "-o", "there.csv")),
+    "extract": ("there.png", ("-", "--plot", "there.png")),
+    "fit": ("there.json", ("-", "--save", "there.json")),
+    "report": ("there.html", ("-", "-o", "new.json", "-o", "there.html")),
+    "sample": ("there.json", ("-", "--steps", "20", "--report", "there.json")),
+    "demo": ("levels.csv", ("-o", ".")),
 }
 
 
 @pytest.mark.parametrize("command", WRITING)
-def test_what_is_there_is_replaced_on_request_only(run, command):
-    there = {"demo": "levels.csv"}.get(command) or next(
-        word for word in WRITING[command] if word.startswith("there")
-    )
-    Path(there).write_text("mine", encoding="utf-8")
-    error = run.refused(command, *WRITING[command])
-    assert error.startswith(f"error: {there}: the file exists already")
+def test_an_existing_file_is_replaced_on_request_only(run, command):
+    existing, arguments = WRITING[command]
+    Path(existing).write_text("mine", encoding="utf-8")
+    error = run.refused(command, *arguments)
+    assert error.startswith(f"error: {existing}: the file exists already")
     assert "--overwrite" in error
-    assert [p.name for p in Path().iterdir()] == [there]
-    assert Path(there).read_text(encoding="utf-8") == "mine"
+    assert [p.name for p in Path().iterdir()] == [existing]
+    assert Path(existing).read_text(encoding="utf-8") == "mine"
 
 
 def test_overwrite_replaces(run):

@@ -1,7 +1,7 @@
-"""Every law in a driven plant: sweeps of another integrator give back what made them.
+"""Every law in a driven plant is estimated from sweeps that another integrator simulates.
 
-Each law is written out once more, as a rate or along its path, and integrated by Runge and Kutta's
-method in fixed steps, from near the steady motion until cycles no longer change.
+Each law is written out again, as a rate or as a function of the path, and integrated by the
+Runge-Kutta method with fixed steps, from rest until the cycles no longer change.
 """
 
 from collections.abc import Callable
@@ -14,8 +14,9 @@ import pytest
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Parameter
+from tests.cold_records import iwan_elements
 from tests.recovery import assert_near
-from tests.test_generic_friction import SlopeOfDahl
+from tests.test_generic_friction import Jenkins, SlopeOfDahl
 
 MASS, DAMPING, STIFFNESS = 0.3, 1.0, 8.0
 F_MAX, SIGMA = 0.1, 30.0
@@ -28,18 +29,8 @@ Law = Callable[[FloatArray, FloatArray], FloatArray]
 """(friction force, velocity) -> rate of the force."""
 
 
-class Jenkins(di.Friction):
-    """A spring that slips: a kink inside the branch."""
-
-    parameters = di.Dahl.parameters[:2]
-
-    def slope(self, force, direction, velocity, values):
-        f_max, sigma = values
-        return sigma * (direction * force < f_max)
-
-
 class Root(di.Friction):
-    """Softens with the root of the force, whose derivative is infinite at 0 N."""
+    """A law that softens with the root of the force, whose derivative is infinite at 0 N."""
 
     parameters = di.Dahl.parameters[:2]
 
@@ -49,7 +40,7 @@ class Root(di.Friction):
 
 
 def root(z, v):
-    """The same by its rate."""
+    """Return the rate of the force of `Root`."""
     return SIGMA * (v - np.abs(v) * np.sign(z) * np.sqrt(np.abs(z) / F_MAX))
 
 
@@ -75,10 +66,10 @@ class Sliders(NamedTuple):
 class Play(NamedTuple):
     """Linear Dahl friction behind a gap: its force, and the position in the gap."""
 
-    half: float
+    half: float  # width of the gap
 
     def at_rest(self, n):
-        """Return force and place of n plants."""
+        """Return force and position of n plants."""
         return np.zeros((2, n))
 
     def after(self, z, moved):
@@ -103,7 +94,7 @@ def loaded(force, side, path):
 
 
 def dahl(exponent=1.0, asymmetry=0.0):
-    """Dahl's law."""
+    """Return the rate of the force of Dahl's law as a function."""
 
     def rate(force, v):
         side = np.sign(v)
@@ -114,37 +105,25 @@ def dahl(exponent=1.0, asymmetry=0.0):
 
 
 def bouc_wen(force, v):
-    """Exponent 1, with other rates for loading and unloading."""
+    """Return the rate of the force of Bouc-Wen's law with exponent 1."""
     loading = force * v > 0.0
     return v * (SIGMA + np.where(loading, -300.0, 100.0) * np.abs(force))
 
 
 def lugre(force, v):
-    """A limit that falls with the speed."""
+    """Return the rate of the force with a limit that falls with the speed."""
     limit = F_MAX * (1.0 + 0.5 * np.exp(-((v / 0.05) ** 2)))
     return SIGMA * (v - np.abs(v) * force / limit)
 
 
-def iwan(chi, ratio, count=150):
-    """Segalman's density in cells, and the stiffness that slips last."""
-    g = chi + 1.0
-    largest = F_MAX / SIGMA * (1.0 + ratio) / (ratio + g / (g + 1.0))
-    edge = np.linspace(0.0, 1.0, count + 1) ** (1.0 / g)
-    stiffness = SIGMA / (1.0 + ratio) * np.diff(edge**g)
-    mean = g / (g + 1.0) * np.diff(edge ** (g + 1.0)) / np.diff(edge**g)
-    last = SIGMA * ratio / (1.0 + ratio)
-    return Sliders(np.append(stiffness, last), largest * np.append(mean, 1.0))
-
-
 class Case(NamedTuple):
-    """A law to be fitted, what made the data, and its parameters there."""
+    """A law to be fitted, the same law for the simulation, and its true parameters."""
 
     law: di.Element
-    by: Law | Sliders | Play
+    simulated: Law | Sliders | Play
     truth: dict[str, float]
-    blind: tuple[str, ...] = ()
-    """Parameters that fundamentals cannot determine."""
-    free: tuple[str, ...] = ("damping", "stiffness")
+    undetermined: tuple[str, ...] = ()  # by fundamentals
+    free: tuple[str, ...] = ("damping", "stiffness")  # of the plant
 
 
 def oscillator(mass, damping, stiffness):
@@ -158,17 +137,19 @@ def positive(start):
 
 
 BOTH = {"f_max": F_MAX, "sigma": SIGMA}
-ONE = Sliders(np.array([SIGMA]), np.array([F_MAX / SIGMA]))
 PAIR = Sliders(np.array([20.0, 10.0]), np.array([0.002, 0.006]))
 CASES = {
     "linear Dahl": Case(di.Dahl(alpha=1.0), dahl(), BOTH),
     "Dahl, free exponent": Case(di.Dahl(alpha=None), dahl(0.7), {**BOTH, "alpha": 0.7}),
     "asymmetric Dahl": Case(
-        di.Dahl(alpha=1.0, asymmetry=None), dahl(1.0, 0.3), BOTH, blind=("asymmetry",)
+        di.Dahl(alpha=1.0, asymmetry=None), dahl(1.0, 0.3), BOTH, undetermined=("asymmetry",)
     ),
     "Bouc-Wen": Case(di.BoucWen(), bouc_wen, {"sigma": SIGMA, "q": 300.0, "p": 100.0}),
     "LuGre": Case(di.LuGre(), lugre, {**BOTH, "static_ratio": 1.5, "stribeck_speed": 0.05}),
-    "Iwan": Case(di.Iwan(), iwan(-0.3, 0.5), {**BOTH, "chi": -0.3, "ratio": 0.5}),
+    "Iwan": Case(
+        di.Iwan(), Sliders(*iwan_elements(F_MAX, SIGMA, -0.3, 0.5)),
+        {**BOTH, "chi": -0.3, "ratio": 0.5},
+    ),
     "Maxwell slip": Case(
         di.MaxwellSlip([0.002, 0.006]), PAIR, {"stiffness_1": 20.0, "stiffness_2": 10.0}
     ),
@@ -178,7 +159,10 @@ CASES = {
     ),
     "Backlash": Case(di.Backlash(di.Dahl(alpha=1.0)), Play(0.001), {**BOTH, "gap": 0.002}),
     "user's law": Case(SlopeOfDahl(alpha=1.0), dahl(), BOTH),
-    "user's law with a kink": Case(Jenkins(), ONE, BOTH),
+    "user's law with a kink": Case(
+        Jenkins(name="pad"), Sliders(np.array([SIGMA]), np.array([F_MAX / SIGMA])),
+        {"pad_stiffness": SIGMA, "pad_slip": F_MAX / SIGMA},
+    ),
     "user's law with a root": Case(Root(), root, BOTH),
     "linear system": Case(
         di.LinearSystem(control.tf([1.0], [MASS, DAMPING, STIFFNESS]), quantity="receptance")
@@ -235,12 +219,12 @@ def settled(law, f, u):
 
 
 def table(case, levels, frequencies):
-    """Return a sweep at some drives, from half the friction force to six times that."""
+    """Return a sweep at several drives, from half the friction force to six times that force."""
     drives = F_MAX * np.geomspace(0.5, 6.0, levels)
     u, f = (
         g.ravel() for g in np.meshgrid(drives, np.geomspace(0.4, 2.6, frequencies), indexing="ij")
     )
-    R = settled(case.by, f, u) / u
+    R = settled(case.simulated, f, u) / u
     s = NOISE * np.abs(R)
     rng = np.random.default_rng(7)
     return di.FrequencyResponse(
@@ -250,15 +234,15 @@ def table(case, levels, frequencies):
     )  # fmt: skip
 
 
-VARIANTS = ("user's law", "linear system", "Dahl, free exponent")  # of others
+VARIANTS = ("user's law", "linear system", "Dahl, free exponent")  # of other cases
 
 
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.long) if n in VARIANTS else n for n in CASES]
 )
-def test_a_law_in_a_driven_plant_is_found(name):
+def test_a_law_in_a_driven_plant_is_estimated(name):
     case = CASES[name]
-    size = (2, 4) if name == "Iwan" else (3, 4)  # the slowest: thirty sliders
+    size = (2, 4) if name == "Iwan" else (3, 4)  # the slowest law
     model = case.law
     if "linear system" not in name:
         model = model + di.Mass(MASS)
@@ -266,6 +250,6 @@ def test_a_law_in_a_driven_plant_is_found(name):
         known = part in case.free and part not in {p.name for p in case.law.parameters}
         model = model + element if known else model
     fit = di.fit(table(case, *size), model)
-    assert fit.trusted or case.blind, fit.verdict
-    assert fit.identifiability.named(di.diagnostics.Verdict.NOT_IDENTIFIED) == [*case.blind]
+    assert fit.trusted or case.undetermined, fit.verdict
+    assert fit.identifiability.named(di.diagnostics.Verdict.NOT_IDENTIFIED) == [*case.undetermined]
     assert_near(fit, case.truth | {part: KNOWN[part] for part in case.free}, 3.0)

@@ -1,3 +1,5 @@
+"""The kernel of linear Dahl friction against Bessel functions with many digits."""
+
 import math
 
 import mpmath as mp
@@ -15,7 +17,7 @@ ODD = (1, 3, 5, 7, 9, 11, 13, 15)
 
 
 def grid(per_decade):
-    """Amplitudes from 1e-12 to 1e12 at random places of a logarithmic grid, and the switches."""
+    """Return random values of beta, a few per decade from 1e-12 to 1e12, and near the switches."""
     rng = np.random.default_rng(20240607)
     steps = np.arange(-12, 12, 1 / per_decade)
     full = 10.0 ** (steps + rng.random(steps.size) / per_decade)
@@ -27,7 +29,7 @@ def grid(per_decade):
 
 
 def exact_gradient(beta):
-    """h, -beta h' and h + beta h' from Bessel functions at 100 digits, up to 60 of them lost."""
+    """Return h, -beta h' and h + beta h' with 100 digits, of which up to 60 cancel."""
     with mp.workdps(100):
         b = mp.mpf(beta)
         tanh, sech = mp.tanh(b), mp.sech(b)
@@ -40,7 +42,7 @@ def exact_gradient(beta):
 
 
 def exact_harmonic(beta, k):
-    """c_k and beta dc_k/dbeta; the sine part is a finite sum, by integration by parts."""
+    """Return c_k and beta dc_k/dbeta; integration by parts makes the sine part a finite sum."""
     with mp.workdps(60):
         b = mp.mpf(beta)
         tanh, sech = mp.tanh(b), mp.sech(b)
@@ -60,17 +62,6 @@ def exact_harmonic(beta, k):
         return complex(real, imag), complex(real_slope, imag_slope)
 
 
-@pytest.fixture(scope="module")
-def betas():
-    return grid(20)
-
-
-@pytest.fixture(scope="module")
-def exact(betas):
-    """The three outputs of the gradient at `betas`, shape (3, n)."""
-    return np.array([exact_gradient(b) for b in betas]).T
-
-
 def modulus_error(value, reference):
     return float(np.max(np.abs(value - reference) / np.abs(reference)))
 
@@ -79,26 +70,20 @@ def part_error(value, reference):
     return float(np.max(np.abs(value / reference - 1.0)))
 
 
-def test_each_part_of_the_describing_function(betas, exact):
-    h = describing_function(betas)
-    assert part_error(h.real, exact[0].real) < 1e-14
-    assert part_error(h.imag, exact[0].imag) < 2e-14
-
-
-def test_derivatives_in_modulus(betas, exact):
+def test_describing_function_and_its_derivatives():
+    betas = grid(20)
+    exact = np.array([exact_gradient(b) for b in betas]).T
     h, by_ln_f_max, by_ln_sigma = describing_function_gradient(betas)
     np.testing.assert_array_equal(h, describing_function(betas))
+    assert part_error(h.real, exact[0].real) < 1e-14
+    assert part_error(h.imag, exact[0].imag) < 2e-14
     assert modulus_error(by_ln_f_max, exact[1]) < 1e-13
     assert modulus_error(by_ln_sigma, exact[2]) < 1e-12
-
-
-def test_each_part_of_the_derivatives(betas, exact):
-    _, by_ln_f_max, by_ln_sigma = describing_function_gradient(betas)
-    away = np.abs(np.log(betas / 1.7)) > 0.3  # from the changes of sign
     assert part_error(by_ln_f_max.real, exact[1].real) < 1e-12
+    assert part_error(by_ln_sigma.imag, exact[2].imag) < 5e-14
+    away = np.abs(np.log(betas / 1.7)) > 0.3  # from the changes of sign
     assert part_error(by_ln_f_max.imag[away], exact[1].imag[away]) < 1e-13
     assert part_error(by_ln_sigma.real[away], exact[2].real[away]) < 1e-12
-    assert part_error(by_ln_sigma.imag, exact[2].imag) < 5e-14
 
 
 @pytest.mark.parametrize("k", ODD)

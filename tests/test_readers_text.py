@@ -1,7 +1,6 @@
 """Text tables: dialects, headers, units, and every way in which they can be wrong."""
 
 import bz2
-import contextlib
 import gzip
 import hashlib
 import lzma
@@ -105,7 +104,7 @@ class TestDialects:
         np.testing.assert_array_equal(record.force, numbers[:, 1])
 
     def test_a_late_word_in_a_long_table(self, tmp_path):
-        """Parsers that read in parts guess types anew in each."""
+        """Parsers that read in parts guess the types of each part."""
         lines = [f"{i},{i % 7},{i % 5}" for i in range(150_000)]
         lines[140_000] = "140000,oops,1"
         text = "time [s],x [mm],F [N]\n" + "\n".join(lines)
@@ -194,14 +193,14 @@ class TestColumns:
 
 
 class TestUnusualTables:
-    def test_what_ends_in_two_delimiters(self, tmp_path):
+    def test_rows_that_end_in_two_delimiters(self, tmp_path):
         text = PLAIN.replace("\n0", ",,\n0").replace(",1\n", ",1,,\n").replace("2\n", "2,,\n")
         assert_the_run(read_record(written(tmp_path, text.replace("3.5\n", "3.5,,\n"))))
 
     def test_colons_between_fields(self, tmp_path):
         assert_the_run(read_record(written(tmp_path, PLAIN.replace(",", ":"), "run.txt")))
 
-    def test_more_columns_than_one_looks_at(self, tmp_path):
+    def test_thousands_of_columns(self, tmp_path):
         rng = np.random.default_rng(1)
         noise = rng.normal(size=(30, 2000))
         lines = ["time [s],x [mm],F [kN]," + ",".join(f"c{i}" for i in range(2000))]
@@ -260,7 +259,7 @@ class TestUnusualTables:
         proposal = written(tmp_path, inspect(tmp_path / "run.csv").column_map, "columns.toml")
         assert read_record(tmp_path / "run.csv", columns=proposal).n == 3
 
-    def test_time_stamps_that_are_none(self, tmp_path):
+    def test_invalid_time_stamps_and_zones(self, tmp_path):
         text = "time,x [mm],F [N]\n12:00:01,1,1\n12:00:61,1,1\n"
         with pytest.raises(
             DataError, match="line 3, column 'time': '12:00:61' is not a time stamp"
@@ -331,16 +330,9 @@ class TestUnusualTables:
             with pytest.raises(DataError, match="line 1: the comment after 'dahl_ident:'"):
                 read_record(written(tmp_path, f"# dahl_ident: {comment}\n{PLAIN}"))
 
-    def test_damaged_compression(self, tmp_path):
-        packed = bytearray(gzip.compress(PLAIN.encode() * 50))
-        for place in range(10, len(packed), 7):
-            damaged = bytes(packed[:place]) + b"\xff\x07" + bytes(packed[place + 2 :])
-            with contextlib.suppress(DataError):
-                read_record(written(tmp_path, damaged, "run.csv.gz"))
-
 
 class TestRefusal:
-    """Never a number from bad input; the message says where and what to do."""
+    """Bad input never gives numbers; the message says where it is and what to do."""
 
     @pytest.mark.parametrize(
         ("text", "message"),
@@ -401,7 +393,7 @@ class TestRefusal:
             read_record(written(tmp_path, text))
 
     @pytest.mark.parametrize("odd", ["1.024", "OVERLOAD"])
-    def test_a_decimal_comma_leaves_points_to_nobody(self, tmp_path, odd):
+    def test_a_point_next_to_decimal_commas_is_refused(self, tmp_path, odd):
         text = PLAIN.replace(",", ";").replace(".", ",").replace("2,5", odd)
         with pytest.raises(DataError, match=f"line 3, column 'x': '{odd}' is not a number with a"):
             read_record(written(tmp_path, text))
@@ -424,6 +416,9 @@ class TestRefusal:
             read_record(written(tmp_path, PLAIN.replace("x [mm]", "x")))
         with pytest.raises(UnitError, match=r"the force has the unit \[mm\]; expected"):
             read_record(written(tmp_path, PLAIN.replace("kN", "mm")))
+        columns = {"displacement": {"unit": "mm"}, "force": {"column": "X"}}
+        with pytest.raises(UnitError, match="the force has the unit"):
+            read_record(written(tmp_path, PLAIN), columns=columns)
         with pytest.raises(UnitError, match=r"column 'F': \[wat\] is not a known unit"):
             read_record(written(tmp_path, PLAIN.replace("kN", "wat")))
         path = written(tmp_path, "t [s],x [deg],F [N],M [Nm]\n0,1,1,1\n1,2,2,2\n")
@@ -453,7 +448,6 @@ class TestRefusal:
             ({"force": {"column": "F", "sign": 2}}, "force.sign is 2; expected 1 or -1"),
             ({"force": {"column": "F", "factor": -2}}, "force.factor is -2.0"),
             ({"force": "load"}, r"no column is called 'load'; there are time, x, F"),
-            ({"displacement": {"unit": "mm"}, "force": {"column": "X"}}, None),
             ({"velocity": {"unit": "mm/s"}}, "no column is called velocity or vel or v"),
             ({"sample_rate": 0}, "sample_rate is 0.0"),
             ({"drive_factor": 12.5}, "drive_factor is 12.5; expected text such as '12.5 N/V'"),
@@ -462,13 +456,8 @@ class TestRefusal:
         ],
     )
     def test_bad_column_maps(self, tmp_path, columns, message):
-        path = written(tmp_path, PLAIN)
-        if message is None:
-            with pytest.raises(UnitError, match="the force has the unit"):
-                read_record(path, columns=columns)
-            return
         with pytest.raises(DataError, match=message):
-            read_record(path, columns=columns)
+            read_record(written(tmp_path, PLAIN), columns=columns)
 
     def test_bad_column_map_files(self, tmp_path):
         path = written(tmp_path, PLAIN)

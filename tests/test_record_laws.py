@@ -22,10 +22,6 @@ LAWS: list[tuple[Element, Element]] = [
     (di.PowerDamper(0.2, 0.5), di.PowerDamper()),
     (di.MaxwellSlip([1e-3, 4e-3], [20.0, 10.0]), di.MaxwellSlip([1e-3, 4e-3])),
 ]
-PLANTS: list[tuple[str, Element, Element]] = [  # others in test_cold_records
-    ("trapezoid", di.PowerDamper(0.5, 0.5), di.PowerDamper()),
-    ("multisine", di.BoucWen(300.0, 1500.0, 3000.0) + di.Damper(0.5), di.BoucWen() + di.Damper()),
-]
 
 
 def displacement(kind, samples):
@@ -47,10 +43,10 @@ def drive(kind, samples):
     return np.asarray(0.03 * np.sum([np.sin(2 * np.pi * (f * t + p)) for f, p in lines], axis=0))
 
 
-def assert_recovered(fit, truth):
-    """Check every free parameter against its uncertainty, which must say something."""
+def assert_recovered(fit, truth, largest_u=0.3):
+    """Check that every free parameter is within 4.5 standard uncertainties, which are small."""
     assert fit.trusted, fit.verdict
-    assert_near(fit, truth, 4.5, 0.3)
+    assert_near(fit, truth, 4.5, largest_u)
 
 
 @pytest.mark.parametrize(
@@ -76,32 +72,28 @@ def driven(kind, whole, samples, noise):
     return di.Record(np.arange(samples) / RATE, displacement=x, force=wave)
 
 
-@pytest.mark.parametrize(("kind", "truth", "model"), PLANTS)
-def test_motion_from_force(kind, truth, model):
-    whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
-    record = driven(kind, whole, 384, 1e-3)
-    assert_recovered(di.fit(record, model + di.Mass() + di.Spring(), throw=False), whole)
+NO_DELAY = di.Sensors(delay=norm(0.0, 1e-9))  # trapezoids do not distinguish it from sigma
 
 
-@pytest.mark.parametrize(
-    ("truth", "model", "noise"),
+@pytest.mark.parametrize(  # others in test_cold_records
+    ("kind", "samples", "noise", "sensors", "truth", "model", "largest_u"),
     [
-        # a curved valley of stiffness and rates; starts with contacts too stiff for the interval
-        (di.BoucWen(300.0, 1500.0, 3000.0) + di.Damper(0.5), di.BoucWen() + di.Damper(), 1e-3),
-        (
-            di.Dahl(0.1, 300.0, asymmetry=0.2) + di.Damper(0.5),
-            di.Dahl(asymmetry=None) + di.Damper(),
-            5e-3,
-        ),
+        ("trapezoid", 384, 1e-3, None, di.PowerDamper(0.5, 0.5), di.PowerDamper(), 0.3),
+        ("multisine", 384, 1e-3, None, di.BoucWen(300.0, 1500.0, 3000.0) + di.Damper(0.5),
+         di.BoucWen() + di.Damper(), 0.3),
+        # hard to search: a curved valley of stiffness and rates
+        ("trapezoid", 512, 1e-3, NO_DELAY, di.BoucWen(300.0, 1500.0, 3000.0) + di.Damper(0.5),
+         di.BoucWen() + di.Damper(), 0.3),
+        # hard to search: starts with contacts too stiff for the interval
+        ("trapezoid", 512, 5e-3, NO_DELAY, di.Dahl(0.1, 300.0, asymmetry=0.2) + di.Damper(0.5),
+         di.Dahl(asymmetry=None) + di.Damper(), 0.6),
     ],
-)
-def test_trapezoids_that_are_hard_to_search(truth, model, noise):
+)  # fmt: skip
+def test_motion_from_force(kind, samples, noise, sensors, truth, model, largest_u):
     whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
-    no_delay = di.Sensors(delay=norm(0.0, 1e-9))  # which such a motion does not tell from sigma
-    record = driven("trapezoid", whole, 512, noise)
-    fit = di.fit(record, model + di.Mass() + di.Spring(), sensors=no_delay)
-    assert fit.trusted, fit.verdict
-    assert_near(fit, whole, 4.5)
+    record = driven(kind, whole, samples, noise)
+    fit = di.fit(record, model + di.Mass() + di.Spring(), sensors=sensors)
+    assert_recovered(fit, whole, largest_u)
 
 
 def damped_record(damper):
@@ -123,10 +115,9 @@ def test_exponent_of_a_damper_stays_between_its_bounds():
 
 def test_damper_that_vanishes_does_not_stop_the_search():
     record = damped_record(lambda v: -0.2 * v)  # no coefficient above zero helps
-    no_delay = di.Sensors(delay=norm(0.0, 1e-9))  # which would stand for the damper
     law = di.Dahl(alpha=1.0)
-    without = di.fit(record, law, sensors=no_delay, throw=False)
-    fit = di.fit(record, law + di.PowerDamper(), sensors=no_delay, throw=False)
+    without = di.fit(record, law, sensors=NO_DELAY, throw=False)
+    fit = di.fit(record, law + di.PowerDamper(), sensors=NO_DELAY, throw=False)
     assert str(fit.status) == "not determined"
     assert 0.0 < fit.params["exponent"].value < 3.0
     for name in ("f_max", "sigma"):
@@ -141,7 +132,7 @@ def test_damper_that_vanishes_does_not_stop_the_search():
     ids=["two elements", "gap"],
 )
 def test_slow_residuals_of_another_law_are_not_trusted(law):
-    """Noise that varies as slowly would hide as much: the records cannot tell."""
+    """The records cannot distinguish them from slow noise."""
     rng = np.random.default_rng(4)
     t = np.arange(2000) / 200.0
     for _ in range(6):
@@ -154,8 +145,7 @@ def test_slow_residuals_of_another_law_are_not_trusted(law):
 
 
 def test_a_search_ends_at_a_kink_of_the_cost():
-    """Samples change their branch next to the minimum, across which the cost does not fall."""
-
+    """Next to the minimum, samples change their branch, and the cost rises on both sides."""
     t = np.arange(2000) / 500.0
     x = 3e-2 * (np.sin(2.0 * t) + np.sin(7.3 * t))
     force = Bilinear(100.0, 1.0).force(x) + 5e-3 * np.random.default_rng(5).standard_normal(t.size)
