@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, response
@@ -33,7 +35,20 @@ def plant_table(noise: float = 0.01, seed: int = 1, steady: Steady = "exact") ->
     f = np.tile(np.geomspace(0.1, 2.0, 12), 5)
     u = np.repeat(np.geomspace(0.02, 1.0, 5), 12)
     R = response(PLANT, f, u, steady=steady).receptance * relative_noise(60, noise, seed)
-    return FrequencyResponse(f, R, drive=u, level=u, controlled="force", quantity="receptance")
+    return driven(f, R, u, level=u)
+
+
+def driven(f: Any, R: Any, u: Any, share: float | None = None, **columns: Any) -> FrequencyResponse:
+    """Return the receptance under held forces; a share of it may be its stated standard error."""
+    C = None if share is None else stated(R, share)
+    return FrequencyResponse(
+        f, R, drive=u, covariance=C, controlled="force", quantity="receptance", **columns
+    )
+
+
+def stated(R: ComplexArray, share: float) -> FloatArray:
+    """Return the covariance of a response whose standard error is a share of it."""
+    return np.asarray((share * np.abs(R))[:, None, None] ** 2 * np.eye(2))
 
 
 def amplitudes(data: FrequencyResponse) -> FloatArray:

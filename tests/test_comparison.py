@@ -11,7 +11,7 @@ from benchmarks.selection import choices
 from dahl_ident import compare_models, fit
 from dahl_ident.diagnostics.held_out import predictive_density
 from dahl_ident.errors import FitError
-from tests.friction_tables import FRICTION, table
+from tests.friction_tables import FRICTION, relative_noise, stated, table
 
 
 @pytest.mark.parametrize(
@@ -21,21 +21,21 @@ def test_the_law_that_made_the_data_is_chosen(law):
     assert [right for _, right in choices(law, 1, seed=5, amplitudes=6)] == [True]
 
 
+def with_third(law, factor=1.0, seed=1):
+    """Return fundamentals of Dahl's law, and third harmonics of a law, stated to 1e-5."""
+    data = table(seed=seed)
+    third = factor * law.dynamic_stiffness(data.amplitude, harmonic=3)
+    covariance = [stated(data.response, share) for share in (0.01, 1e-5)]
+    return di.FrequencyResponse(
+        np.ones(60), np.concatenate([data.response, third]), np.tile(data.amplitude, 2),
+        harmonic=np.repeat([1, 3], 30), covariance=np.concatenate(covariance),
+    )  # fmt: skip
+
+
 def test_tiny_covariances_of_harmonics_do_not_rule():
     """A third harmonic that is 5 % off, stated to 1e-5: no difference for tests left out."""
-    data = table()
-    third = FRICTION.dynamic_stiffness(data.amplitude, harmonic=3) * 1.05
-    size = np.abs(data.response)
-    both = di.FrequencyResponse(
-        np.ones(60),
-        np.concatenate([data.response, third]),
-        np.tile(data.amplitude, 2),
-        harmonic=np.repeat([1, 3], 30),
-        covariance=np.concatenate([0.01 * size, 1e-5 * size])[:, None, None] ** 2 * np.eye(2),
-    )
-    plain, spring = compare_models(
-        fit(both, di.Dahl(), throw=False), {"spring": di.Dahl() + di.Spring()}
-    ).models
+    given = fit(with_third(FRICTION, 1.05), di.Dahl(), throw=False)
+    plain, spring = compare_models(given, {"spring": di.Dahl() + di.Spring()}).models
     assert spring.density.gain_over(plain.density)[0] < 10.0
 
 
@@ -47,11 +47,9 @@ def test_what_means_the_same_whatever_the_law():
     first, gap, spring = (model.meaning for model in found.models)
     assert first["force limit"] == pytest.approx(0.1, rel=0.01)
     assert gap["stiffness at zero force"] == pytest.approx(30.0, rel=0.01)
-    energies = [value for key, value in first.items() if key.startswith("energy")]
-    sizes = [float(key.split()[-2]) for key in first if key.startswith("energy")]
-    assert energies == pytest.approx(
-        [float(FRICTION.dissipated_energy(A)) for A in sizes], rel=0.05
-    )
+    energies = {float(key.split()[-2]): value for key, value in first.items() if "energy" in key}
+    for A, energy in energies.items():
+        assert energy == pytest.approx(float(FRICTION.dissipated_energy(A)), rel=0.05)
     assert spring["force limit"] == 0.0
     assert "energy a cycle" in str(found)
 
@@ -111,7 +109,7 @@ def test_the_model_that_was_fitted_stands_with_what_it_states():
 
 def test_what_runs_away_is_not_determined():
     """Microslip: any limit of the force would do."""
-    data = table(beta=(1e-4, 1e-3), noise=0.01)
+    data = table(beta=(1e-4, 1e-3), n=8, noise=0.01)
     found = compare_models(fit(data, di.Dahl(), throw=False), {"gap": di.Backlash(di.Dahl())})
     assert {row[1] for row in found.meanings} == {"not determined"}
     assert {row[5] for row in found.rows} == {"-"}
@@ -122,8 +120,7 @@ def test_a_damper_is_told_from_another_loop_at_one_frequency():
     A = np.geomspace(3e-4, 3e-2, 12)
     truth = di.Dahl(0.1, 30.0, alpha=1.0) + di.PowerDamper(0.02, 0.5)
     exact = truth.dynamic_stiffness(A, np.full(A.size, 2.0 * np.pi))
-    noise = 0.01 * np.random.default_rng(0).standard_normal((2, A.size)).T @ [1.0, 1.0j]
-    data = di.FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
+    data = di.FrequencyResponse(np.ones(A.size), exact * relative_noise(A.size, 0.01, 0), A)
     comparison = compare_models(fit(data, di.Dahl(alpha=1.0), throw=False))
     assert comparison.best.name == "power damper added"
     assert comparison.best.meaning["force limit"] == pytest.approx(0.1, rel=0.03)
@@ -151,10 +148,8 @@ def test_two_jenkins_elements_are_maxwell_slip():
     """Not the law of a free exponent that leaves ten times as much."""
     A = np.geomspace(0.1, 10.0, 12) / 300.0
     exact = di.MaxwellSlip([1e-3, 8e-3], [20.0, 10.0]).describing_function(A)
-    noise = 0.01 * np.random.default_rng(0).standard_normal((2, A.size)).T @ [1.0, 1.0j]
-    comparison = compare_models(
-        fit(di.FrequencyResponse(np.ones(12), exact * np.exp(noise), A), di.Dahl())
-    )
+    data = di.FrequencyResponse(np.ones(12), exact * relative_noise(12, 0.01, 0), A)
+    comparison = compare_models(fit(data, di.Dahl()))
     assert "Maxwell slip" in comparison.headline
     assert comparison.best.name in ("Maxwell slip", "as fitted")
 
@@ -180,7 +175,7 @@ def test_the_law_of_a_record_is_recognised():
     noise = 2e-4 * np.random.default_rng(0).standard_normal(T.size)
     force = loop(X) + noise
     record = di.Record(T, displacement=X, force=force)
-    laws = {"Bouc-Wen": di.BoucWen(), "Maxwell slip": di.MaxwellSlip(3)}
+    laws = {"Bouc-Wen": di.BoucWen(), "Maxwell slip": di.MaxwellSlip(2)}
     comparison = compare_models(fit(record, di.Dahl(alpha=1.0), throw=False), laws)
     first, true, slips = comparison.models
     assert comparison.best is true
@@ -216,8 +211,10 @@ def test_the_density_of_a_record_is_that_of_blocks_left_out():
 
 
 def test_a_damper_is_added_to_a_law_with_an_exponent():
-    fit = di.fit(di.load_dataset("alpha_2"), di.BoucWen(30.0, 300.0, exponent=0.6), throw=False)
-    comparison = di.compare_models(fit)
+    data = di.load_dataset("alpha_2")
+    data = data.select(rows=np.arange(data.n) % 3 == 0)
+    given = fit(data, di.BoucWen(30.0, 300.0, exponent=0.6), throw=False)
+    comparison = compare_models(given)
     assert not comparison.failed
     assert "power damper added" in [model.name for model in comparison.models]
 
@@ -244,8 +241,7 @@ def test_a_power_damper_is_found_where_dahl_alone_slips_at_once():
 def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere():
     A = np.geomspace(1e-3, 1e-1, 12)
     exact = di.Dahl(0.1, 30.0, alpha=30.0).describing_function(A)
-    noise = 0.003 * np.random.default_rng(1).standard_normal((2, A.size)).T @ [1.0, 1.0j]
-    data = di.FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
+    data = di.FrequencyResponse(np.ones(A.size), exact * relative_noise(12, 0.003, 1), A)
     alone = compare_models(fit(data, di.Dahl(alpha=None), throw=False), {})
     assert not alone.best.is_physical  # an exponent of 30
     assert alone.best is alone.models[0]
@@ -257,19 +253,8 @@ def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere():
 
 def test_harmonics_of_tiny_covariance_do_not_spoil_the_fundamental():
     """Fundamentals of Dahl's law, third harmonics of tiny covariance that only a gap explains."""
-    data = table(noise=0.01, seed=23)
-    third = di.Backlash(FRICTION, 2e-3).dynamic_stiffness(data.amplitude, harmonic=3)
-    size = np.abs(data.response)
-    both = di.FrequencyResponse(
-        np.ones(60),
-        np.concatenate([data.response, third]),
-        np.tile(data.amplitude, 2),
-        harmonic=np.repeat([1, 3], 30),
-        covariance=np.concatenate([0.01 * size, 1e-5 * size])[:, None, None] ** 2 * np.eye(2),
-    )
-    comparison = compare_models(
-        fit(both, di.Dahl(alpha=1), throw=False), {"gap": di.Backlash(di.Dahl(alpha=1))}
-    )
+    data, linear = with_third(di.Backlash(FRICTION, 2e-3), seed=23), di.Dahl(alpha=1)
+    comparison = compare_models(fit(data, linear, throw=False), {"gap": di.Backlash(linear)})
     plain, gap = comparison.models
     assert gap.density.misfit < 1.1 * plain.density.misfit
     assert comparison.best is plain
@@ -277,11 +262,11 @@ def test_harmonics_of_tiny_covariance_do_not_spoil_the_fundamental():
 
 def test_a_force_that_falls_with_the_speed_asks_for_lugre():
     """From no guess, next to harmonics that say nothing."""
-    law, n = di.LuGre(0.1, 350.0, 1.94, 0.01), 5
+    law, n = di.LuGre(0.1, 350.0, 1.94, 0.01), 4
     A = np.tile(np.repeat(0.1 / 350.0 * np.geomspace(0.1, 10.0, n), 2), 3)
     f, rng, parts = np.tile([1.0, 3.0], 3 * n), np.random.default_rng(3), []
     size = 0.01 * np.abs(law.dynamic_stiffness(A, 2.0 * np.pi * f))
-    for order in (1, 2, 3):
+    for order in (1, 2):
         N = law.dynamic_stiffness(A, 2.0 * np.pi * f, harmonic=order)
         N = N + size * (rng.standard_normal((len(A), 2)) @ [1.0, 1.0j])
         noise, which = size[:, None, None] ** 2 * np.eye(2), np.full(len(A), order)

@@ -24,7 +24,7 @@ from dahl_ident.diagnostics import budget, error_model
 from dahl_ident.diagnostics.error_sources import repeated_levels
 from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.errors import FitError
-from tests.friction_tables import FRICTION, X_C, relative_noise, table
+from tests.friction_tables import FRICTION, X_C, driven, relative_noise, stated, table
 
 
 def modelled(data, model=None):
@@ -42,12 +42,12 @@ def three_days(scatter, seed):
     return FrequencyResponse(np.ones(36), N, A, run=np.repeat(["mon", "tue", "wed"], 12))
 
 
-def gross_errors(data, seed, stated):
+def gross_errors(data, seed, known):
     """Return a table with a tenth of its rows off by ten times the noise or more."""
     rng, factors = np.random.default_rng(seed), np.ones(data.n, dtype=np.complex128)
     factors[rng.choice(data.n, data.n // 10, replace=False)] = 1.0 + rng.uniform(0.1, 0.4)
-    C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
-    return replace(data, response=data.response * factors, covariance=C if stated else None)
+    C = stated(data.response, 0.01) if known else None
+    return replace(data, response=data.response * factors, covariance=C)
 
 
 class TestVariances:
@@ -211,13 +211,10 @@ class TestBudget:
         slopes = [30.0 * (f if scatters != "f_max" else 1.0) for f in factors]
         laws = [Dahl(*values) for values in zip(limits, slopes, strict=True)]
         N = np.concatenate([law.describing_function(A) for law in laws])
-        size = 1e-4 * np.abs(N)
-        noise = size * (rng.standard_normal((2, N.size)).T @ [1.0, 1j])
+        noise = 1e-4 * np.abs(N) * (rng.standard_normal((2, N.size)).T @ [1.0, 1j])
         run = np.repeat(factors, 8).astype(str)
-        data = FrequencyResponse(
-            np.ones(N.size), N + noise, np.tile(A, len(laws)), run=run,
-            covariance=size[:, None, None] ** 2 * np.eye(2),
-        )  # fmt: skip
+        data = FrequencyResponse(np.ones(N.size), N + noise, np.tile(A, len(laws)), run=run,
+                                 covariance=stated(N, 1e-4))  # fmt: skip
         found = fit(data, Dahl(alpha=1.0))
         assert found.status == "approximate", found.verdict
         assert found.goodness.objections == (str(found.goodness.of("runs differ")[0]),)
@@ -297,14 +294,9 @@ class TestBudget:
         rng, u = np.random.default_rng(4), np.tile([0.3, 1.0, 3.0], 4)
         f = np.repeat(np.geomspace(0.2, 2.0, 4), 3)
         model = Spring() + Damper()
-        R = (
-            1.0
-            / (40.0 + 2j * np.pi * f * 1.5)
-            * np.exp(1e-3 * rng.standard_normal((12, 2)) @ [1, 1j])
-        )
-        data = FrequencyResponse(f, R, drive=u, controlled="force", quantity="receptance",
-                                 drive_factor_uncertainty=0.02)  # fmt: skip
-        found = fit(data, model).budget()
+        noise = np.exp(1e-3 * rng.standard_normal((12, 2)) @ [1, 1j])
+        R = noise / (40.0 + 2j * np.pi * f * 1.5)
+        found = fit(driven(f, R, u, drive_factor_uncertainty=0.02), model).budget()
         for name in ("stiffness", "damping"):
             by_source = {row.source: row.u for row in found[name].rows}
             assert by_source["drive factor"] == pytest.approx(0.02 * found[name].value, rel=1e-2)
@@ -335,10 +327,7 @@ class TestBudget:
         phase = np.exp(-1j * np.radians([5.0, 20.0, 40.0]))
         for sizes in ([0.03, 0.035, 0.1], [0.03, 0.035, 0.12], [0.03, 0.033, 0.08],
                       [0.031, 0.035, 0.08], [0.028, 0.033, 0.12]):  # fmt: skip
-            data = FrequencyResponse(
-                np.ones(3), np.array(sizes) * phase, drive=np.array([0.1, 0.3, 0.4]),
-                quantity="receptance", controlled="force",
-            )  # fmt: skip
+            data = driven(np.ones(3), np.array(sizes) * phase, np.array([0.1, 0.3, 0.4]))
             fitted = fit(data, Dahl(), throw=False)
             if fitted.stated_budget is None:  # which of them, is up to rounding
                 with pytest.raises(FitError, match="no uncertainty budget"):
@@ -434,14 +423,14 @@ class TestEstimate:
     @pytest.mark.parametrize(
         "loss", ["huber", pytest.param("soft_l1", marks=pytest.mark.long), "student_t"]
     )
-    @pytest.mark.parametrize("stated", [False, True])
-    def test_a_robust_loss_counts_every_source(self, loss, stated):
+    @pytest.mark.parametrize("known", [False, True])
+    def test_a_robust_loss_counts_every_source(self, loss, known):
         """As least squares does without the gross errors: exponent, days, noise."""
         for seed in (3, 5):
             data = three_days(0.05, seed)
             clean, robust = (
                 fit(one, Dahl(), loss=by)
-                for one, by in ((data, "linear"), (gross_errors(data, seed, stated), loss))
+                for one, by in ((data, "linear"), (gross_errors(data, seed, known), loss))
             )
             assert robust.trusted
             assert robust.assumed == ("alpha",)
@@ -480,9 +469,7 @@ class TestEstimate:
         """Bouc-Wen loops fitted by Dahl: as leaving out tests one by one says, within a factor."""
         A = np.geomspace(0.2, 10.0, 10) * X_C
         N = BoucWen(30.0, 300.0, 150.0).describing_function(A) * relative_noise(10, 0.002, 3)
-        data = FrequencyResponse(
-            np.ones(10), N, A, covariance=(0.002 * np.abs(N))[:, None, None] ** 2 * np.eye(2)
-        )
+        data = FrequencyResponse(np.ones(10), N, A, covariance=stated(N, 0.002))
         whole = modelled(data)
         moved = [
             modelled(data.select(rows=np.arange(10) != i)).theta - whole.theta for i in range(10)
@@ -503,11 +490,8 @@ class TestEstimate:
 
         truth = np.array([0.1, 30.0, 1.0, 0.3, 0.24, 0.3])
         R, noise = receptance(*truth), np.random.default_rng(seed).standard_normal((2, 75))
-        data = FrequencyResponse(
-            f, R * (1.0 + 0.01 * (noise[0] + 1j * noise[1])), drive=drive, level=drive,
-            controlled="force", quantity="receptance",
-            covariance=(0.01 * np.abs(R))[:, None, None] ** 2 * np.eye(2),
-        )  # fmt: skip
+        noisy = R * (1.0 + 0.01 * (noise[0] + 1j * noise[1]))
+        data = replace(driven(f, noisy, drive, level=drive), covariance=stated(R, 0.01))
         found = fit(data, Dahl() + Mass() + Damper() + Spring())
         changes = [receptance(*(truth * step)) / R - 1.0 for step in 1.0 + 1e-4 * np.eye(6)]
         J = np.array(changes) / 1e-4 / 0.01

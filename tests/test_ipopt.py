@@ -1,15 +1,16 @@
-from collections.abc import Callable, Mapping
+"""IPOPT: the same optimum as least squares, constraints, errors of the drive."""
+
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import control
 import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import BoucWen, Dahl, Damper, FitResult, LinearSystem, Mass, Spring
+from dahl_ident import BoucWen, Dahl, Damper, FitResult, LinearSystem, Mass, Parameter, Spring
 from dahl_ident import fit as any_fit
 from dahl_ident import response as any_response
 from dahl_ident.data import FrequencyResponse, Record
@@ -18,6 +19,7 @@ from dahl_ident.fitting import Status, ipopt, solve
 from dahl_ident.fitting.ipopt import solve_ipopt
 from dahl_ident.problem import TableProblem as AnyProblem
 from dahl_ident.sensors import Sensors
+from tests.friction_tables import driven, stated
 from tests.recovery import assert_near
 
 # closed forms are fast, and predict the same whichever way the search came; exact rows further down
@@ -25,12 +27,11 @@ TableProblem: Any = partial(AnyProblem, steady="describing function")
 fit = partial(any_fit, steady="describing function")
 response = partial(any_response, steady="describing function")
 
-Symbols = Mapping[str, ca.SX]
-
 AMPLITUDE = np.geomspace(1e-5, 1e-1, 24)
 FRICTION = Dahl(f_max=0.1, sigma=30.0)
 PLANT = FRICTION + Mass(0.3) + Damper(0.24) + Spring(0.3)
 UNKNOWN_PLANT = Dahl() + Mass() + Damper() + Spring()
+LINEAR = Dahl(alpha=1.0)
 
 
 def noise(n, size=0.02, seed=1):
@@ -44,9 +45,8 @@ def friction_data(truth=FRICTION, size=0.02, **columns):
     return FrequencyResponse(np.ones(AMPLITUDE.size), measured, AMPLITUDE, **columns)
 
 
-def covariance_of(truth=FRICTION, size=0.02):
-    N = truth.dynamic_stiffness(AMPLITUDE, 2.0 * np.pi)
-    return np.abs(N)[:, None, None] ** 2 * size**2 * np.eye(2)
+KNOWN = stated(FRICTION.describing_function(AMPLITUDE), 0.02)
+"""The covariance of those data."""
 
 
 def of_quantity(receptance, frequency_hz, quantity):
@@ -62,13 +62,8 @@ def plant_data(levels=5, frequencies=12, quantity="receptance", size=0.02):
     drive = np.repeat(np.geomspace(0.02, 5.0, levels), frequencies)
     frequency = np.tile(np.geomspace(0.03, 3.0, frequencies), levels)
     R = of_quantity(response(PLANT, frequency, drive).receptance, frequency, quantity)
-    return FrequencyResponse(
-        frequency,
-        R * np.exp(noise(drive.size, size)),
-        drive=drive,
-        controlled="force",
-        quantity=quantity,
-    )
+    R *= np.exp(noise(drive.size, size))
+    return FrequencyResponse(frequency, R, drive=drive, controlled="force", quantity=quantity)
 
 
 def assert_same(found, expected):
@@ -88,18 +83,14 @@ def assert_same(found, expected):
 CASES: dict[str, Callable[[], AnyProblem]] = {
     "relative": lambda: TableProblem(friction_data(), Dahl()),
     "absolute": lambda: TableProblem(friction_data(), Dahl(), noise="absolute"),
-    "measured": lambda: TableProblem(friction_data(covariance=covariance_of()), Dahl()),
+    "measured": lambda: TableProblem(friction_data(covariance=KNOWN), Dahl()),
     "few degrees of freedom": lambda: TableProblem(
-        friction_data(covariance=covariance_of(), dof=5.0), Dahl()
+        friction_data(covariance=KNOWN, dof=5.0), Dahl()
     ),
     "error of the amplitude": lambda: TableProblem(
         friction_data(
-            covariance=covariance_of(),
-            dof=9.0,
-            amplitude_std=0.03 * AMPLITUDE,
-            amplitude_covariance=-2e-4
-            * np.outer(AMPLITUDE, [20.0, 10.0])
-            / (1.0 + np.outer(AMPLITUDE, [300.0, 300.0])),
+            covariance=KNOWN, dof=9.0, amplitude_std=0.03 * AMPLITUDE,
+            amplitude_covariance=np.outer(AMPLITUDE / (1.0 + 300.0 * AMPLITUDE), [-4e-3, -2e-3]),
         ),
         Dahl(),
     ),
@@ -130,16 +121,11 @@ CASES: dict[str, Callable[[], AnyProblem]] = {
         plant_data(levels=4, frequencies=6), Dahl(alpha=None) + Mass() + Damper() + Spring()
     ),
     "plant in other units": lambda: TableProblem(
-        FrequencyResponse(
-            plant_data().frequency_hz * 1e3,
-            plant_data().response * 1e-9,
-            drive=np.asarray(plant_data().drive) * 1e6,
-            controlled="force",
-            quantity="receptance",
-        ),
+        driven(1e3 * plant_data().frequency_hz, 1e-9 * plant_data().response,
+               1e6 * plant_data().drive),
         UNKNOWN_PLANT,
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -157,10 +143,7 @@ def exact_data(plant):
     drive = np.repeat([0.04, 0.2, 1.0], 5)
     frequency = np.tile(np.geomspace(0.3, 2.0, 5), 3)
     R = any_response(plant, frequency, drive, steady="exact").receptance
-    return FrequencyResponse(
-        frequency, R * np.exp(noise(15, 0.005)), drive=drive, controlled="force",
-        quantity="receptance",
-    )  # fmt: skip
+    return driven(frequency, R * np.exp(noise(15, 0.005)), drive)
 
 
 @pytest.mark.parametrize(
@@ -183,26 +166,17 @@ def test_exact_steady_motion(plant, unknown):
     assert held.cost == pytest.approx(fixed.cost, rel=1e-6)
 
 
-SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
-
-
 @pytest.mark.parametrize("loss", ["huber", "student_t"])
 def test_robust_losses(loss):
-    data = friction_data(covariance=covariance_of())
+    data = friction_data(covariance=KNOWN)
     spoiled = data.response * np.where(np.arange(data.n) == 7, 1.3, 1.0)
-    problem = TableProblem(
-        FrequencyResponse(data.frequency_hz, spoiled, data.amplitude, covariance=data.covariance),
-        Dahl(),
-    )
+    problem = TableProblem(replace(data, response=spoiled), Dahl())
     assert_same(solve_ipopt(problem, loss=loss), solve(problem, loss=loss))
 
 
 def test_bound():
-    model = Dahl()
-    f_max = model.parameters[0]
-    bounded = model + Spring(1e-3)
-    bounded = bounded.with_parameters({"f_max": type(f_max)("f_max", "N", "", lower=0.12)})
-    problem = TableProblem(friction_data(), bounded)
+    bound = {"f_max": Parameter("f_max", "N", "", lower=0.12)}
+    problem = TableProblem(friction_data(), (Dahl() + Spring(1e-3)).with_parameters(bound))
     found = solve_ipopt(problem)
     assert found.status is Status.AT_BOUND
     assert found.values == pytest.approx(solve(problem).values, rel=1e-6)
@@ -231,9 +205,8 @@ def test_equality_can_make_an_undetermined_parameter_known():
     problem = TableProblem(friction_data(), Dahl() + Spring(name="own") + Spring(name="other"))
     alone = solve_ipopt(problem)
     assert alone.status is Status.SINGULAR
-    tied = solve_ipopt(
-        problem, constraints=lambda p: [p["own_stiffness"] == 3 * p["other_stiffness"]]
-    )
+    by = "own_stiffness", "other_stiffness"
+    tied = solve_ipopt(problem, constraints=lambda p: [p[by[0]] == 3 * p[by[1]]])
     assert tied.status is Status.CONVERGED
     assert np.isfinite(tied.covariance).all()
     single = solve(TableProblem(friction_data(), Dahl() + Spring()))
@@ -256,15 +229,10 @@ def test_inequality_binds_only_where_it_has_to():
 
 def test_a_calibration_does_not_hide_that_a_constraint_binds():
     plain, calibrated = (
-        any_fit(
-            friction_data(),
-            Dahl(alpha=1.0),
-            method="ipopt",
-            sensors=sensors,
-            constraints=lambda p: [p["sigma"] >= 310 * p["f_max"]],
-        )
+        any_fit(friction_data(), Dahl(alpha=1.0), method="ipopt", sensors=sensors,
+                constraints=lambda p: [p["sigma"] >= 310 * p["f_max"]])
         for sensors in (None, Sensors(force_gain=stats.norm(1.0, 0.01)))
-    )
+    )  # fmt: skip
     assert calibrated.optimum.status is Status.AT_BOUND
     assert calibrated.status is plain.status
     chances = [fit.optimum.constraint_cost.p_value for fit in (plain, calibrated)]
@@ -312,15 +280,12 @@ def test_noise_of_the_drive():
     force_error = noise(n, s, seed=8)
     drive = exact.drive * np.exp(force_error.real)
     R = exact.response * np.exp(noise(n, own, seed=9) - force_error)
-    C = np.abs(R)[:, None, None] ** 2 * (own**2 + s**2) * np.eye(2)
+    C = stated(R, np.hypot(own, s))
     cross = -(s**2) * (R * drive)
     shared = np.stack([cross.real, cross.imag], axis=1)
 
     def table(true_drive):
-        return FrequencyResponse(
-            exact.frequency_hz, R, drive=true_drive, controlled="force", quantity="receptance",
-            covariance=C,
-        )  # fmt: skip
+        return driven(exact.frequency_hz, R, true_drive, np.hypot(own, s))
 
     problem = TableProblem(table(drive), UNKNOWN_PLANT)
     found = solve_ipopt(problem, drive_std=s * drive, drive_covariance=shared)
@@ -356,13 +321,14 @@ def test_noise_of_the_drive():
         (lambda p: [p["sigma"] / 2], ValidationError, r"constraints\[0\] is .*expected a compar"),
         (lambda p: [p["alpha"] <= 2], ValidationError, r"\(alpha<=2\), holds no free parameter"),
         (lambda p: [1 <= p["sigma"] <= 2], ValidationError, "chains comparisons"),
-        (
-            lambda p: [p["sigma"] <= 1, p["sigma"] >= 2],
-            FitError,
-            "no parameters satisfy the constraints sigma<=1; 2<=sigma",
-        ),
+        (lambda p: [p["sigma"] <= 1, p["sigma"] >= 2], FitError,
+         "no parameters satisfy the constraints sigma<=1; 2<=sigma"),
+        (lambda p: p["sigma"] == 300.0 * p["f_max"], ValidationError,
+         "expected a list of comparisons: lambda p"),
+        (dict.clear, ValidationError, "constraints returned None; expected a list of comparisons"),
+        ("sigma <= 1", ValidationError, "constraints is 'sigma <= 1'; expected a function: lamb"),
     ],
-)
+)  # fmt: skip
 def test_bad_constraints(constraints, error, message):
     problem = TableProblem(friction_data(), Dahl())
     with pytest.raises(error, match=message):
@@ -379,18 +345,12 @@ def test_misplaced_errors_of_the_drive():
         solve_ipopt(TableProblem(friction_data(), Dahl()), drive_std=0.1)
     with pytest.raises(ValidationError, match="relative noise and linear loss"):
         solve_ipopt(TableProblem(plant_data(3, 4), UNKNOWN_PLANT), drive_std=0.1)
-    driven = plant_data(3, 4)
-    covariance = np.abs(driven.response[:, None, None]) ** 2 * 1e-4 * np.eye(2)
-    known = FrequencyResponse(
-        driven.frequency_hz, driven.response, drive=driven.drive, controlled="force",
-        quantity="receptance", covariance=covariance,
-    )  # fmt: skip
+    plant = plant_data(3, 4)
+    known = replace(plant, covariance=stated(plant.response, 0.01))
     with pytest.raises(ValidationError, match=r"drive_std: expected shape \(12,\), .*got \(3,\)"):
         solve_ipopt(TableProblem(known, UNKNOWN_PLANT), drive_std=[0.1, 0.2, 0.3])
     with pytest.raises(ValidationError, match="without drive_std"):
-        solve_ipopt(
-            TableProblem(plant_data(3, 4), UNKNOWN_PLANT), drive_covariance=np.zeros((12, 2))
-        )
+        solve_ipopt(TableProblem(plant, UNKNOWN_PLANT), drive_covariance=np.zeros((12, 2)))
 
 
 def test_plant_with_several_amplitudes_stays_on_the_one_measured():
@@ -399,14 +359,8 @@ def test_plant_with_several_amplitudes_stays_on_the_one_measured():
     every = response(plant, frequency, drive, all_roots=True)
     assert every.number_of_solutions.max() == 3
     largest = (np.arange(frequency.size), every.number_of_solutions - 1)
-    data = FrequencyResponse(
-        frequency,
-        every.receptance[largest] * np.exp(noise(frequency.size, 0.01)),
-        every.amplitude[largest],
-        drive,
-        controlled="force",
-        quantity="receptance",
-    )
+    R = every.receptance[largest] * np.exp(noise(frequency.size, 0.01))
+    data = driven(frequency, R, drive, amplitude=every.amplitude[largest])
     problem = TableProblem(data, UNKNOWN_PLANT)
     assert_same(solve_ipopt(problem), solve(problem))
 
@@ -425,30 +379,13 @@ def test_nothing_is_printed(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize(
-    ("constraints", "message"),
-    [
-        (lambda p: p["sigma"] == 300.0 * p["f_max"], "expected a list of comparisons: lambda p"),
-        (dict.clear, "constraints returned None; expected a list of comparisons"),
-        ("sigma <= 1", "constraints is 'sigma <= 1'; expected a function: lambda p"),
-    ],
-)
-def test_what_is_no_list_of_constraints_is_refused(constraints, message):
-    with pytest.raises(ValidationError, match=message):
-        solve_ipopt(TableProblem(friction_data(), Dahl()), constraints=constraints)
-
-
 @pytest.mark.long
 def test_noise_of_the_drive_is_judged_as_it_was_fitted():
     """Residuals, intervals and errors of an exact model count what its drive is off by."""
     exact = plant_data(3, 4, size=0.0)
     drive = exact.drive * np.exp(noise(12, 0.05, seed=8).real)
     R = exact.response * np.exp(noise(12, 0.02, seed=9))
-    C = np.abs(R)[:, None, None] ** 2 * 0.02**2 * np.eye(2)
-    data = FrequencyResponse(
-        exact.frequency_hz, R, drive=drive, controlled="force", quantity="receptance",
-        covariance=C,
-    )  # fmt: skip
+    data = driven(exact.frequency_hz, R, drive, 0.02)
     plant = Dahl(alpha=1.0) + Mass() + Damper() + Spring()
     result = fit(data, plant, method="ipopt", drive_std=0.05 * drive, throw=False)
     # of the estimate, a third of a standard error from the optimum at most
@@ -478,9 +415,7 @@ def test_a_robust_loss_does_not_hide_a_contradicted_constraint(kind):
         def tied(p: Any, ratio: float = ratio) -> list[Any]:
             return [p["sigma"] == 300.0 * ratio * p["f_max"]]
 
-        found = any_fit(
-            data, Dahl(alpha=1.0), method="ipopt", loss="huber", throw=False, constraints=tied
-        )
+        found = any_fit(data, LINEAR, method="ipopt", loss="huber", throw=False, constraints=tied)
         assert str(found.status) == status, found.verdict
 
 
@@ -496,15 +431,15 @@ def test_an_exponent_that_was_not_given_is_estimated_with_constraints():
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_constraint_that_the_data_contradict_is_said_so(known):
-    data = friction_data(covariance=covariance_of() if known else None)
-    law = Dahl(alpha=1.0)
+    data = friction_data(covariance=KNOWN if known else None)
 
     def tied(ratio):
-        return fit(
-            data, law, method="ipopt", constraints=lambda p: [p["sigma"] == ratio * p["f_max"]]
-        )
+        def constraints(p):
+            return [p["sigma"] == ratio * p["f_max"]]
 
-    free = fit(data, law)
+        return fit(data, LINEAR, method="ipopt", constraints=constraints)
+
+    free = fit(data, LINEAR)
     right, wrong = tied(300.0), tied(330.0)
     assert "contradict" not in right.verdict
     assert "the constraint sigma==(300*f_max)" in right.verdict
@@ -513,9 +448,8 @@ def test_a_constraint_that_the_data_contradict_is_said_so(known):
     assert "consistent with noise" not in wrong.verdict
     if known:
         residuals = wrong.optimum.residuals
-        assert wrong.goodness.of("chi-square")[0].values["value"] == pytest.approx(
-            residuals @ residuals, rel=1e-6
-        )
+        value = wrong.goodness.of("chi-square")[0].values["value"]
+        assert value == pytest.approx(residuals @ residuals, rel=1e-6)
     cost = wrong.optimum.constraint_cost
     rise = 2.0 * (wrong.optimum.cost - free.optimum.cost) / free.optimum.scale**2
     assert cost.rise == pytest.approx(rise, rel=1e-6)

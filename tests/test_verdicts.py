@@ -26,7 +26,7 @@ from dahl_ident import (
     response,
 )
 from dahl_ident.diagnostics import Verdict
-from tests.friction_tables import FRICTION, X_C, relative_noise, table
+from tests.friction_tables import FRICTION, X_C, driven, relative_noise, stated, table
 
 STEPS = np.geomspace(1e-3, 1e-1, 8)  # too few rows for a comparison of bands
 
@@ -36,9 +36,8 @@ def stiffened(rise, noise=0.01, seed=1):
     A = np.geomspace(1e-3, 1e-1, 48) * X_C
     N = FRICTION.describing_function(A)
     upper = np.clip(np.log(A / A[24]) / np.log(A[-1] / A[24]), 0.0, 1.0)
-    return FrequencyResponse(
-        np.ones(48), N * relative_noise(48, noise, seed) + 30.0 * rise * upper, A
-    )
+    N = N * relative_noise(48, noise, seed) + 30.0 * rise * upper
+    return FrequencyResponse(np.ones(48), N, A)
 
 
 def rise(data, model=None):
@@ -106,8 +105,7 @@ class TestTrust:
 
     def test_two_points_of_known_noise_are_judged_by_it(self):
         data = table(n=2, noise=0.01, seed=3)
-        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
-        known = FrequencyResponse(data.frequency_hz, data.response, data.amplitude, covariance=C)
+        known = replace(data, covariance=stated(data.response, 0.01))
         assert fit(known, Dahl()).goodness.judged
 
     def test_one_amplitude_does_not_test_the_model(self):
@@ -129,8 +127,7 @@ class TestTrust:
         A = np.geomspace(1.0, 20.0, 8) * X_C
         law = MaxwellSlip([0.3 * X_C, 2.4 * X_C], [20.0, 10.0])
         N = law.describing_function(A) * relative_noise(8, 0.01, 11)
-        C = (0.01 * np.abs(N))[:, None, None] ** 2 * np.eye(2)
-        result = fit(FrequencyResponse(np.ones(8), N, A, covariance=C), Dahl())
+        result = fit(FrequencyResponse(np.ones(8), N, A, covariance=stated(N, 0.01)), Dahl())
         assert 0.05 < result.goodness.rms_misfit < 0.2
         assert result.status.value == "not described"
         assert "law of parallel Jenkins elements (MaxwellSlip, Iwan) leaves 0." in result.verdict
@@ -180,10 +177,7 @@ class TestWords:
 
     def test_one_chi_square(self, tmp_path):
         data = table(n=12)
-        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
-        rough = FrequencyResponse(
-            data.frequency_hz, data.response, data.amplitude, covariance=C, dof=np.full(12, 4.0)
-        )
+        rough = replace(data, covariance=stated(data.response, 0.01), dof=np.full(12, 4.0))
         found = fit(rough, Dahl())
         text = found.fit_report()
         assert text.count("chi-square ") == 1 + text.count("and chi-square")
@@ -272,10 +266,7 @@ class TestNamed:
         N = FRICTION.describing_function(A) * relative_noise(14, 0.01, 1)
         for strongest, named in ((0.09, False), (0.12, True)):
             kept = np.abs(N) * A < strongest
-            data = FrequencyResponse(
-                np.ones(kept.sum()), 1.0 / N[kept], drive=(np.abs(N) * A)[kept],
-                controlled="force", quantity="receptance",
-            )  # fmt: skip
+            data = driven(np.ones(kept.sum()), 1.0 / N[kept], (np.abs(N) * A)[kept])
             found = fit(data, Dahl(), steady="describing function", throw=False)
             assert ("the force held exceeds friction's limit (0." in found.verdict) is named
             if named:
@@ -287,11 +278,8 @@ class TestNamed:
         f = np.tile(np.linspace(9.0, 14.0, 6), 4)
         u = np.repeat([6.0, 12.0, 18.4, 60.0], 6)
         R = response(plant, f, u).receptance * relative_noise(24, 0.005, 3)
-        size = (0.005 * np.abs(R))[:, None, None] ** 2 * np.eye(2)
-        data = FrequencyResponse(
-            f, R, drive=u, level=u, controlled="force", quantity="receptance", covariance=size
-        )
-        found = fit(data, Dahl(alpha=1.0) + Mass(40.0) + Damper() + Spring())
+        model = Dahl(alpha=1.0) + Mass(40.0) + Damper() + Spring()
+        found = fit(driven(f, R, u, 0.005, level=u), model)
         assert "beyond_limit" not in {one.code for one in found.findings}
         assert found.trusted
 
@@ -412,14 +400,13 @@ class TestDescribed:
     """The status of laws and devices that one Dahl element is not; never better without noise."""
 
     @staticmethod
-    def status(N, A, *, stated, run=None):
+    def status(N, A, *, known, run=None):
         noisy = N * relative_noise(len(A), 0.01, 4)
-        C = (0.01 * np.abs(noisy))[:, None, None] ** 2 * np.eye(2) if stated else None
-        return fit(
-            FrequencyResponse(np.ones(len(A)), noisy, A, covariance=C, run=run), Dahl(), throw=False
-        )
+        C = stated(noisy, 0.01) if known else None
+        data = FrequencyResponse(np.ones(len(A)), noisy, A, covariance=C, run=run)
+        return fit(data, Dahl(), throw=False)
 
-    @pytest.mark.parametrize("stated", [True, False])
+    @pytest.mark.parametrize("known", [True, False])
     @pytest.mark.parametrize(
         "law",
         [
@@ -428,23 +415,23 @@ class TestDescribed:
             Dahl(0.1, 30.0, alpha=0.265),
         ],
     )
-    def test_another_law_is_not_trusted(self, law, *, stated):
+    def test_another_law_is_not_trusted(self, law, *, known):
         """Unless twelve rows of unknown noise look like the law, and its numbers are right."""
         A = X_C * np.geomspace(0.1, 10.0, 12)
-        found = self.status(law.describing_function(A), A, stated=stated)
+        found = self.status(law.describing_function(A), A, known=known)
         limits = found.conf_interval()
         right = all(
             limits[name][1].lower < value < limits[name][1].upper
             for name, value in (("f_max", 0.1), ("sigma", 30.0))
         )
-        assert not found.trusted or (not stated and right)
+        assert not found.trusted or (not known and right)
 
-    @pytest.mark.parametrize("stated", [True, False])
-    def test_several_devices_are_not_one(self, *, stated):
+    @pytest.mark.parametrize("known", [True, False])
+    def test_several_devices_are_not_one(self, *, known):
         limits, A = 0.1 * np.geomspace(0.4, 1.7, 6), X_C * np.geomspace(0.2, 8.0, 8)
         N = np.concatenate([Dahl(f, 300.0 * f).describing_function(A) for f in limits])
         run = np.repeat([f"band {i}" for i in range(6)], 8)
-        result = self.status(N, np.tile(A, 6), stated=stated, run=run)
+        result = self.status(N, np.tile(A, 6), known=known, run=run)
         assert result.status == "not described"
         assert "the runs differ (gain by" in result.verdict
 
