@@ -84,14 +84,8 @@ def test_rows_for_harmonics_amplitude_and_drive():
 def test_units_and_the_clock_do_not_matter(shift, force_scale, displacement_scale):
     w = waves(cycles=6, noise=1e-3)
     once = extract(w.record(), harmonics=(1, 3))
-    again = extract(
-        Record(
-            w.time + shift,
-            displacement=displacement_scale * w.displacement,
-            force=force_scale * w.force,
-        ),
-        harmonics=(1, 3),
-    )
+    x, force = displacement_scale * w.displacement, force_scale * w.force
+    again = extract(Record(w.time + shift, displacement=x, force=force), harmonics=(1, 3))
     scale = force_scale / displacement_scale
     np.testing.assert_allclose(again.response / scale, once.response, rtol=1e-6)
     np.testing.assert_allclose(again.covariance / scale**2, once.covariance, rtol=1e-3, atol=1e-14)
@@ -104,12 +98,9 @@ def test_velocity_and_acceleration_are_integrated(channel):
     theta = 0.4 + omega * w.time
     rng = np.random.default_rng(1)
     motion = -2.0 * omega * np.sin(theta) if channel == "velocity" else -w.displacement * omega**2
-    noisy = motion + 1e-3 * rng.standard_normal(theta.size)
+    noisy: Any = {channel: motion + 1e-3 * rng.standard_normal(theta.size)}
     force = w.force + 1e-4 * rng.standard_normal(theta.size)
-    if channel == "velocity":
-        data = extract(Record(w.time, velocity=noisy, force=force))
-    else:
-        data = extract(Record(w.time, acceleration=noisy, force=force))
+    data = extract(Record(w.time, force=force, **noisy))
     assert data.amplitude[0] == pytest.approx(2.0, rel=1e-4)
     assert_near_truth(data)
 
@@ -342,27 +333,17 @@ def test_clipping_is_reported():
     assert quality["displacement_clipped"][0] == pytest.approx(np.arccos(0.95) / np.pi, abs=0.01)
     assert quality["force_clipped"][0] == pytest.approx(np.mean(w.force > 0.6), abs=0.03)
     assert "displacement clipped in 10 % of samples" in quality["verdict"][0]
-    clean = extract(w.record(), harmonics=(1,)).quality
-    assert clean["displacement_clipped"][0] == clean["force_clipped"][0] == 0.0
-
-
-def test_a_force_that_saturates_is_not_clipped():
-    w = waves(beta=50.0, noise=0.0)
-    quality = extract(w.record(), harmonics=(1,)).quality
-    assert quality["force_clipped"][0] == 0.0
+    for good in (w, waves(beta=50.0, noise=0.0)):  # a force that saturates is not clipped
+        clean = extract(good.record(), harmonics=(1,)).quality
+        assert clean["displacement_clipped"][0] == clean["force_clipped"][0] == 0.0
 
 
 def test_labels_and_origin_are_kept():
     w = waves()
     record = Record(
-        w.time,
-        displacement=w.displacement,
-        drive=w.force / 2.0,
-        drive_unit="V",
-        drive_factor=2.0,
-        motion="rotation",
-        provenance={"file": "run07.csv"},
-    )
+        w.time, displacement=w.displacement, drive=w.force / 2.0, drive_unit="V", drive_factor=2.0,
+        motion="rotation", provenance={"file": "run07.csv"},
+    )  # fmt: skip
     data = extract(record, level="2 mm", controlled="force", harmonics=(1,))
     assert data.motion == "rotation"
     assert data.level.tolist() == ["2 mm"]
@@ -372,12 +353,6 @@ def test_labels_and_origin_are_kept():
     assert_near_truth(data)
 
 
-def two_tones(n=4000):
-    time = np.arange(n) / RATE
-    x = np.sin(2.0 * np.pi * time) + np.sin(2.0 * np.pi * 2.6 * time)
-    return Record(time, displacement=x, force=x)
-
-
 @pytest.mark.parametrize(("seed", "n"), [(10, 16626), (16, 3314), (28, 10796)])
 def test_noise_is_no_sine_however_often_two_cycles_of_it_look_alike(seed, n):
     motion, force = np.random.default_rng(seed).standard_normal((2, n))
@@ -385,30 +360,25 @@ def test_noise_is_no_sine_however_often_two_cycles_of_it_look_alike(seed, n):
         extract(Record(np.arange(n) / 1000.0, displacement=motion, force=force))
 
 
-def test_two_tones_are_refused_with_their_share():
-    with pytest.raises(ExtractionError, match=r"fundamental has \d+(\.\d)? % of the power"):
-        extract(two_tones(), frequency=1.0)
+TURN = 2.0 * np.pi * np.arange(4000) / RATE
 
 
-def test_a_force_that_is_noise_is_refused():
-    w = waves()
-    rng = np.random.default_rng(0)
-    record = Record(w.time, displacement=w.displacement, force=rng.standard_normal(w.time.size))
-    with pytest.raises(ExtractionError, match=r"force around t = .* has 0\.\d+ % of the power"):
-        extract(record)
-
-
-def test_less_motion_than_the_sensors_step_is_refused():
-    time = np.arange(4000) / RATE
-    x = np.round(0.51 * np.sin(2.0 * np.pi * time)) * 1e-6
-    with pytest.raises(ExtractionError, match=r"displacement .* sensor steps \(of 1e-06\)"):
-        extract(Record(time, displacement=x, force=np.sin(2.0 * np.pi * time)))
-
-
-def test_a_dead_force_is_refused():
-    w = waves()
-    with pytest.raises(ExtractionError, match=r"force around .*: amplitude 0 is 0 sensor steps"):
-        extract(Record(w.time, displacement=w.displacement, force=np.zeros(w.time.size)))
+@pytest.mark.parametrize(
+    ("motion", "force", "message"),
+    [
+        (np.sin(TURN) + np.sin(2.6 * TURN), np.sin(TURN) + np.sin(2.6 * TURN),
+         r"fundamental has \d+(\.\d)? % of the power"),
+        (np.sin(TURN), np.random.default_rng(0).standard_normal(4000),
+         r"force around t = .* has 0\.\d+ % of the power"),
+        (1e-6 * np.round(0.51 * np.sin(TURN)), np.sin(TURN),
+         r"displacement .* sensor steps \(of 1e-06\)"),
+        (np.sin(TURN), np.zeros(4000), r"force around .*: amplitude 0 is 0 sensor steps"),
+    ],
+    ids=["two tones", "a force of noise", "less than a step", "a dead force"],
+)  # fmt: skip
+def test_what_is_no_sine_is_refused(motion, force, message):
+    with pytest.raises(ExtractionError, match=message):
+        extract(Record(np.arange(4000) / RATE, displacement=motion, force=force), frequency=1.0)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import copy
 import pickle
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,14 +104,8 @@ class TestValidation:
             ({"covariance": [np.eye(2)] * 2, "dof": [1.0, 0.0]}, r"dof\[1\] is 0.0"),
             ({"amplitude_std": [-1.0, 1.0]}, r"amplitude_std\[0\] is -1.0"),
             ({"amplitude_covariance": [[0.0, 0.0]] * 2}, "without amplitude_std"),
-            (
-                {
-                    "covariance": [np.eye(2)] * 2,
-                    "amplitude_std": [1.0, 1.0],
-                    "amplitude_covariance": [[0.0, 0.0], [1.5, 0.0]],
-                },
-                r"covariance\[1\]",
-            ),
+            ({"covariance": [np.eye(2)] * 2, "amplitude_std": [1.0, 1.0],
+              "amplitude_covariance": [[0.0, 0.0], [1.5, 0.0]]}, r"covariance\[1\]"),
             ({"controlled": "speed"}, "controlled is 'speed'"),
             ({"harmonic": [1, 1.5]}, "whole numbers, got 1.5"),
             ({"harmonic": [1, 3], "quantity": "receptance"}, "harmonics of the force are rows of"),
@@ -123,16 +117,17 @@ class TestValidation:
             ({"level": ["a"]}, "level: expected shape"),
             ({"quality": {"settled": [True]}}, "quality 'settled'"),
             ({"quality": {"settled": [1j, 2j]}}, "expected numbers or text"),
+            ({"amplitude": None, "drive": [1.0, 1.0], "amplitude_std": [0.1, 0.1]},
+             "amplitude_std is given without amplitude"),
+            ({"drive_std": [0.1, 0.1]}, "drive_std is given without drive"),
+            ({"harmonic": [0, 1], "response": [1.0, 1j], "covariance": [np.eye(2)] * 2},
+             "imaginary part an error"),
         ],
-    )
+    )  # fmt: skip
     def test_impossible_fields_are_refused(self, arguments, message):
         good = {"frequency_hz": [1.0, 2.0], "response": [1j, 2j], "amplitude": [1e-3, 2e-3]}
         with pytest.raises(ValidationError, match=message):
             FrequencyResponse(**{**good, **arguments})
-
-    def test_amplitude_std_needs_amplitude(self):
-        with pytest.raises(ValidationError, match="amplitude_std is given without amplitude"):
-            FrequencyResponse([1.0], [1j], drive=[1.0], amplitude_std=[0.1])
 
     def test_survives_pickle_and_copy(self):
         data = full_table()
@@ -168,24 +163,17 @@ class TestConversion:
         out = data.to(target)
         h = 1e-6 * data.gain
         J = np.empty((data.n, 2, 2))
+        plain = replace(data, covariance=None, dof=None, amplitude_covariance=None)
         for k, step in enumerate((h, 1j * h)):
-            up, down = (
-                FrequencyResponse(
-                    data.frequency_hz, data.response + sign * step, data.amplitude, quantity=source
-                )
-                .to(target)
-                .response
-                for sign in (1, -1)
-            )
-            slope = (up - down) / (2 * h)
+            ends = [replace(plain, response=data.response + by).to(target) for by in (step, -step)]
+            slope = (ends[0].response - ends[1].response) / (2 * h)
             J[:, :, k] = np.stack([slope.real, slope.imag], -1)
         scale = np.abs(J).max() ** 2 * np.abs(covariance).max()
         expected = J @ covariance @ J.swapaxes(1, 2)
         np.testing.assert_allclose(out.covariance, expected, rtol=1e-6, atol=1e-9 * scale)
         cross = np.einsum("nij,nj->ni", J, amplitude_covariance)
-        np.testing.assert_allclose(
-            out.amplitude_covariance, cross, rtol=1e-6, atol=1e-9 * np.abs(cross).max()
-        )
+        size = np.abs(cross).max()
+        np.testing.assert_allclose(out.amplitude_covariance, cross, rtol=1e-6, atol=1e-9 * size)
         np.testing.assert_array_equal(out.amplitude_std, data.amplitude_std)
 
     def test_harmonics_stay_dynamic_stiffness(self):
@@ -205,13 +193,9 @@ class TestConversion:
 class TestSelection:
     def test_by_level_frequency_harmonic_and_rows(self):
         data = FrequencyResponse(
-            [1.0, 2.0, 3.0, 3.0],
-            [1j, 2j, 3j, 4j],
-            [1e-3] * 4,
-            level=[0.2, 0.5, 0.5, 0.2],
-            harmonic=[1, 1, 1, 3],
-            quality={"settled": [True, False, True, True]},
-        )
+            [1.0, 2.0, 3.0, 3.0], [1j, 2j, 3j, 4j], [1e-3] * 4, level=[0.2, 0.5, 0.5, 0.2],
+            harmonic=[1, 1, 1, 3], quality={"settled": [True, False, True, True]},
+        )  # fmt: skip
         assert data.levels == [0.2, 0.5]
         assert data.select(level=0.5).response.tolist() == [2j, 3j]
         assert data.select(level=[0.2, 0.5], harmonic=1).n == 3
@@ -234,10 +218,6 @@ class TestSelection:
         with pytest.raises(ValidationError, match=message):
             data.select(**conditions)
 
-    def test_level_of_a_table_without_levels(self):
-        with pytest.raises(ValidationError, match="no level"):
-            FrequencyResponse([1.0], [1j], [1e-3]).select(level=0.2)
-
     def test_concatenate(self):
         one, other = full_table(4, 1), full_table(5, 2)
         both = FrequencyResponse.concatenate([one, other])
@@ -246,18 +226,15 @@ class TestSelection:
         assert_same(both.select(rows=np.arange(9) >= 4), other)
         assert both.provenance == {"parts": [one.provenance, other.provenance]}
 
-    @pytest.mark.parametrize(
-        "other",
-        [
-            full_table(harmonic=1, quantity="mobility"),
-            full_table(dof=None),
-            full_table(level=3.0),
-            full_table(motion="rotation"),
-        ],
-    )
-    def test_concatenate_refuses_what_differs(self, other):
+    @pytest.mark.parametrize("other", [
+        full_table(harmonic=1, quantity="mobility"), full_table(dof=None), full_table(level=3.0),
+        full_table(motion="rotation"),
+    ])  # fmt: skip
+    def test_concatenate_refuses_what_differs_and_nothing(self, other):
         with pytest.raises(ValidationError, match=r"parts\[1\] .* does not go with parts\[0\]"):
             FrequencyResponse.concatenate([full_table(), other])
+        with pytest.raises(ValidationError, match="at least one table"):
+            FrequencyResponse.concatenate([])
 
     def test_runs_are_text_and_can_be_selected(self):
         data = FrequencyResponse([1.0] * 3, [1j] * 3, [1e-3] * 3, run=[2, 2, 10.5])
@@ -266,12 +243,11 @@ class TestSelection:
         assert "2 runs" in repr(data)
         with pytest.raises(ValidationError, match=r"no run \['3'\]; there are 2, 10.5"):
             data.select(run="3")
+        bare = FrequencyResponse([1.0], [1j], [1e-3])
         with pytest.raises(ValidationError, match="there are none"):
-            FrequencyResponse([1.0], [1j], [1e-3]).select(run="a")
-
-    def test_concatenate_refuses_nothing(self):
-        with pytest.raises(ValidationError, match="at least one table"):
-            FrequencyResponse.concatenate([])
+            bare.select(run="a")
+        with pytest.raises(ValidationError, match="no level"):
+            bare.select(level=0.2)
 
 
 @pytest.mark.filterwarnings("ignore::dahl_ident.errors.DataWarning")
@@ -312,8 +288,6 @@ class TestTables:
         np.testing.assert_allclose(polar.response, data.response, rtol=1e-12)
         assert polar.response[0].imag == 0.0
         np.testing.assert_array_equal(polar.covariance[0], np.diag([4.0, 0.0]))
-        with pytest.raises(ValidationError, match="imaginary part an error"):
-            FrequencyResponse([1.0], [1.0], [1e-3], covariance=[np.eye(2)], harmonic=0)
 
     @settings(max_examples=30)
     @given(
@@ -342,15 +316,8 @@ class TestTables:
         np.testing.assert_allclose(frame["gain [N/m]"], data.gain)
         np.testing.assert_allclose(frame["phase_deg"], np.degrees(data.phase))
         # ln R = ln gain + j phase, so the errors of both are those of dR/R
-        J = np.linalg.inv(
-            np.stack(
-                [
-                    np.stack([data.response.real, -data.response.imag], -1),
-                    np.stack([data.response.imag, data.response.real], -1),
-                ],
-                -2,
-            )
-        )
+        a, b = data.response.real, data.response.imag
+        J = np.linalg.inv(np.moveaxis(np.array([[a, -b], [b, a]]), -1, 0))
         expected = np.sqrt(np.diagonal(J @ data.covariance @ J.swapaxes(1, 2), axis1=1, axis2=2))
         np.testing.assert_allclose(frame["gain_std [N/m]"] / data.gain, expected[:, 0])
         np.testing.assert_allclose(np.radians(frame["phase_std_deg"]), expected[:, 1])
@@ -417,28 +384,16 @@ class TestTelling:
     def test_repr_shows_levels_ranges_units(self):
         text = repr(full_table(motion="rotation", harmonic=[1, 3, 1, 3, 1, 3, 1]))
         facts = (
-            "7 points of dynamic stiffness, rotation",
-            "7 levels",
-            "0 N, #0",
-            "rad, zero to peak",
-            "N m, zero to peak",
-            "N m/rad",
-            "force, displacement",
-            "harmonics",
-            "degrees of freedom",
-            "settled",
-            "run.csv",
-        )
-        for fact in facts:
-            assert fact in text, fact
+            "7 points of dynamic stiffness, rotation", "7 levels", "0 N, #0", "rad, zero to peak",
+            "N m, zero to peak", "N m/rad", "force, displacement", "harmonics",
+            "degrees of freedom", "settled", "run.csv",
+        )  # fmt: skip
+        assert [fact for fact in facts if fact not in text] == []
 
     def test_units(self):
-        assert full_table(motion="rotation").to("mobility").units == {
-            "frequency_hz": "Hz",
-            "amplitude": "rad",
-            "drive": "N m",
-            "response": "rad/(N m s)",
-        }
+        units = {"frequency_hz": "Hz", "amplitude": "rad", "drive": "N m"}
+        turning = full_table(motion="rotation").to("mobility")
+        assert turning.units == units | {"response": "rad/(N m s)"}
 
     def test_html_escapes(self):
         data = FrequencyResponse([1.0], [1j], [1e-3], level=["<b>"])
@@ -464,12 +419,8 @@ class TestTelling:
         top, bottom = levels.plot()
         assert bottom.get_xlabel() == "frequency [Hz]"
         assert len(top.get_lines()) == 2
-        sweep = full_table(
-            frequency_hz=np.ones(7),
-            level=None,
-            harmonic=[1, 1, 1, 1, 1, 3, 3],
-            controlled="displacement",
-        )
+        sweep = full_table(frequency_hz=np.ones(7), level=None, harmonic=[1, 1, 1, 1, 1, 3, 3],
+                           controlled="displacement")  # fmt: skip
         axes = plt.figure().subplots(2)
         top, bottom = sweep.plot(ax=axes)
         assert top is axes[0]
@@ -490,5 +441,3 @@ def test_errors_of_the_drive_are_kept_in_files(tmp_path):
     stiff = data.to("dynamic_stiffness")
     back = stiff.to("receptance")
     assert back.drive_covariance == pytest.approx(data.drive_covariance)
-    with pytest.raises(ValidationError, match="drive_std is given without drive"):
-        FrequencyResponse([1.0], [1.0 + 1j], amplitude=[1e-3], drive_std=[0.1])

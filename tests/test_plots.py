@@ -253,17 +253,10 @@ AWKWARD = {  # name, centre, spread, logarithmic
 }
 
 
-def _awkward(count):
-    chosen = list(AWKWARD.values())[:count]
-    normal = np.random.default_rng(3).standard_normal((3200, count))
-    draws = np.stack(
-        [
-            np.exp(centre + spread * z) if log else centre + spread * z
-            for z, (_, centre, spread, log) in zip(normal.T, chosen, strict=True)
-        ],
-        axis=-1,
-    )
-    return [name for name, *_ in chosen], draws, [log for *_, log in chosen]
+def _spread(name, z):
+    """Return values of a parameter whose name, spread and logarithm are awkward."""
+    _, centre, spread, log = AWKWARD[name]
+    return np.exp(centre + spread * z) if log else centre + spread * z
 
 
 @pytest.mark.parametrize(
@@ -271,7 +264,10 @@ def _awkward(count):
 )
 @pytest.mark.versions
 def test_labels_of_corner_and_trace_do_not_collide(count):
-    names, draws, log = _awkward(count)
+    chosen = list(AWKWARD)[:count]
+    normal = np.random.default_rng(3).standard_normal((3200, count))
+    draws = np.column_stack([_spread(name, z) for name, z in zip(chosen, normal.T, strict=True)])
+    names, log = [AWKWARD[name][0] for name in chosen], [AWKWARD[name][3] for name in chosen]
     grid = plots.plot_corner(names, draws, log=log)
     assert colliding_labels(grid[0, 0].figure) == []
     rows = plots.plot_trace(names, draws.reshape(100, 32, count), log=log, discard=20)
@@ -281,9 +277,9 @@ def test_labels_of_corner_and_trace_do_not_collide(count):
 @pytest.mark.parametrize("name", AWKWARD)
 @pytest.mark.parametrize("width", [2.4, 4.6])
 def test_labels_of_profiles_do_not_collide(name, width):
-    label, centre, spread, log = AWKWARD[name]
+    label, _, _, log = AWKWARD[name]
     z = np.linspace(-3.2, 3.2, 21)
-    value = np.exp(centre + spread * z) if log else centre + spread * z
+    value = _spread(name, z)
     axis = style.new_axes(1, 1, size=(width, 1.9), sharex=False)[0, 0]
     limits = {"68.27 %": 1.0, "95.45 %": 4.0, "99.73 %": 9.0}
     best = float(value[10])
@@ -293,19 +289,11 @@ def test_labels_of_profiles_do_not_collide(name, width):
     assert len(ticks.intersection(_drawn(axis.figure))) >= 2
 
 
-def _amplitude(ax):
-    return plots.plot_amplitude_response(A, N, ax=ax)
-
-
-def _frequency(ax):
-    return plots.plot_frequency_response([("1 N", A, N)], ax=ax)
-
-
-def _cycles(ax):
-    return plots.plot_cycles(N, A, ax=ax)
-
-
-PAIRS = (_amplitude, _frequency, _cycles)
+PAIRS: dict[str, Callable[[Any], Any]] = {
+    "amplitude": lambda ax: plots.plot_amplitude_response(A, N, ax=ax),
+    "frequency": lambda ax: plots.plot_frequency_response([("1 N", A, N)], ax=ax),
+    "cycles": lambda ax: plots.plot_cycles(N, A, ax=ax),
+}
 SINGLES: dict[str, Callable[[Axes], Axes]] = {
     "universal curve": lambda ax: plots.plot_universal_curve(N, curve=N, ax=ax),
     "loops": lambda ax: plots.plot_loops([(A, A, "a")], ax=ax),
@@ -333,33 +321,27 @@ def test_a_fitted_phase_lies_on_the_turn_of_its_points():
     np.testing.assert_allclose(np.asarray(curve.get_ydata()), [178.5, 180.5, 182.5])
 
 
-@pytest.mark.parametrize("draw", SINGLES.values(), ids=SINGLES.keys())
+@pytest.mark.parametrize("draw", SINGLES.values(), ids=SINGLES)
 @pytest.mark.versions
 def test_single_plots_draw_on_the_axes_given(draw):
     figure, ax = plt.subplots()
     assert draw(ax) is ax
     assert figure.axes == [ax]
-    plt.close(figure)
 
 
-@pytest.mark.parametrize("draw", PAIRS)
+@pytest.mark.parametrize("draw", PAIRS.values(), ids=PAIRS)
 @pytest.mark.versions
 def test_plots_of_two_parts_draw_on_the_axes_given(draw):
     figure, pair = plt.subplots(2, 1)
     assert list(draw(pair)) == list(pair)
     assert len(figure.axes) == 2
-    plt.close(figure)
-    figure, ax = plt.subplots()
     with pytest.raises(ValidationError, match="ax holds 1 axes; expected 2"):
-        draw(ax)
-    plt.close(figure)
+        draw(pair[0])
 
 
 def test_corner_refuses_axes_of_another_shape():
-    figure, grid = plt.subplots(1, 2)
     with pytest.raises(ValidationError, match=r"ax has shape \(2,\); expected \(2, 2\)"):
-        plots.plot_corner(["a", "b"], DRAWS, ax=grid)
-    plt.close(figure)
+        plots.plot_corner(["a", "b"], DRAWS, ax=plt.subplots(1, 2)[1])
 
 
 def test_only_wide_ranges_are_drawn_over_their_logarithm():
@@ -450,13 +432,12 @@ def test_the_house_style_stays_in_its_figures():
 
 def test_axes_of_the_user_are_drawn_on_in_the_house_style():
     with mpl.rc_context({"legend.fontsize": 13.0, "lines.linewidth": 4.0}):
-        figure, ax = plt.subplots()
+        _, ax = plt.subplots()
         plots.plot_loops([(A, A, "a")], ax=ax)
         assert mpl.rcParams["legend.fontsize"] == 13.0
     (line,), legend = ax.lines, ax.get_legend()
     assert line.get_linewidth() == style.RC["lines.linewidth"]
     assert legend.get_texts()[0].get_fontsize() == style.RC["legend.fontsize"]
-    plt.close(figure)
 
 
 @pytest.mark.versions

@@ -32,9 +32,8 @@ RECEPTANCE = np.array([1e-4 - 2e-4j, -3e-5 - 5e-4j, -4e-4 - 1e-5j])
 
 def assert_the_run(record, rtol=1e-14):
     for name, expected in (("time", TIME), ("displacement", X), ("force", F)):
-        np.testing.assert_allclose(
-            getattr(record, name), expected, rtol=rtol, atol=rtol * np.abs(expected).max()
-        )
+        size = np.abs(expected).max()
+        np.testing.assert_allclose(getattr(record, name), expected, rtol=rtol, atol=rtol * size)
 
 
 def cells():
@@ -60,10 +59,6 @@ class TestExcel:
         book.save(path)
         return path
 
-    def test_only_table(self, tmp_path):
-        top = [["Rig", None, "5"], [None, None, None]]
-        assert_the_run(read_record(self.book(tmp_path / "run.xlsx", top=top)))
-
     def test_sheets(self, tmp_path):
         path = self.book(tmp_path / "run.xlsx", sheets=("a", "b"))
         with pytest.raises(DataError, match="sheets a, b hold tables; name one with sheet='a'"):
@@ -87,7 +82,7 @@ class TestExcel:
             read_record(path)
 
     def test_a_sheet_with_a_chart_alone(self, tmp_path):
-        path = self.book(tmp_path / "run.xlsx")
+        path = self.book(tmp_path / "run.xlsx", top=[["Rig", None, "5"], [None, None, None]])
         book = openpyxl.load_workbook(path)
         book.create_chartsheet("picture", 0)
         book.save(path)
@@ -224,17 +219,14 @@ class TestMatlab:
         assert_the_run(read_record(matlab, columns=run))
 
     def test_columns_of_a_matrix(self, matlab):
-        run = {"time": "table[:,0]", "displacement": "table[:,1]", "force": "table[:,2]"}
         units = {"time": "s", "displacement": "mm", "force": "kN"}
-        columns = {role: {"column": name, "unit": units[role]} for role, name in run.items()}
+        columns = {role: {"column": f"table[:,{i}]", "unit": unit}
+                   for i, (role, unit) in enumerate(units.items())}  # fmt: skip
         assert_the_run(read_record(matlab, columns=columns))
 
     def test_one_struct_of_an_array(self, matlab):
-        columns = {
-            "frequency": "sweep.levels[2].f [Hz]",
-            "response": "sweep.levels[2].H [m/N]",
-            "drive": "sweep.levels[2].u0 [N]",
-        }
+        names = {"frequency": "f [Hz]", "response": "H [m/N]", "drive": "u0 [N]"}
+        columns = {role: f"sweep.levels[2].{name}" for role, name in names.items()}
         data = read_frequency_response(matlab, columns=columns)
         np.testing.assert_allclose(data.response, 3 * RECEPTANCE)
         assert data.levels == []
@@ -251,9 +243,7 @@ class TestMatlab:
         assert data.controlled.tolist() == ["force"] * 3 + ["displacement"] * 6
         np.testing.assert_allclose(data.response, (RECEPTANCE * np.array([[1], [2], [3]])).ravel())
         columns["controlled"] = {"force": "*0?"}
-        with pytest.raises(
-            DataError, match=r"level 'levels\[1\]' matches no pattern of controlled"
-        ):
+        with pytest.raises(DataError, match=r"'levels\[1\]' matches no pattern of controlled"):
             read_frequency_response(matlab, columns=columns)
 
     def test_contents(self, matlab):
@@ -278,32 +268,27 @@ class TestMatlab:
             read_record(matlab, time="rig.run.q", displacement="rig.run.x", force="rig.run.F")
         with pytest.raises(DataError, match=r"nothing matches 'sweep.\*.f'"):
             read_frequency_response(matlab, columns={"frequency": "sweep.*.f"})
+        names = {"frequency": "sweep.levels[*].f", "response": "sweep.level*[0].H"}
         with pytest.raises(DataError, match=r"same levels; only one .* levels\[1\], levels\[2\]"):
-            read_frequency_response(
-                matlab, columns={"frequency": "sweep.levels[*].f", "response": "sweep.level*[0].H"}
-            )
+            read_frequency_response(matlab, columns=names)
 
-    def test_lengths(self, matlab):
-        with pytest.raises(DataError, match="differ in length: displacement 64, time 64, force 3"):
-            read_record(
-                matlab, time="rig.run.t [s]", displacement="rig.run.x [mm]", force="cells[0] [N]"
-            )
-
-    def test_units_are_asked_for(self, matlab):
+    def test_lengths_and_units(self, matlab):
+        run = {"displacement": "rig.run.x [mm]", "force": "rig.run.F [kN]"}
         with pytest.raises(UnitError, match=r"column 'rig.run.t' has no unit"):
-            read_record(matlab, force="rig.run.F [kN]", displacement="rig.run.x [mm]")
+            read_record(matlab, columns=run)
+        run |= {"time": "rig.run.t [s]", "force": "cells[0] [N]"}
+        with pytest.raises(DataError, match="differ in length: displacement 64, time 64, force 3"):
+            read_record(matlab, columns=run)
 
     def test_nan_names_its_index(self, tmp_path):
         savemat(tmp_path / "a.mat", {"t": TIME, "x": np.where(TIME[9] == TIME, np.nan, X), "F": F})
         with pytest.raises(DataError, match="index 9, column 'x': the cell is empty or NaN"):
             read_record(tmp_path / "a.mat", time="t [s]", displacement="x [m]", force="F [N]")
 
-    def test_no_matlab_file(self, tmp_path):
+    def test_nothing_of_use(self, tmp_path):
         (tmp_path / "a.mat").write_bytes(b"\x07\x08\x00" * 99)
         with pytest.raises(DataError, match="the file is damaged or not a MATLAB file"):
             read_record(tmp_path / "a.mat")
-
-    def test_nothing_but_a_cube(self, tmp_path):
         savemat(tmp_path / "a.mat", {"cube": np.zeros((3, 4, 5))})
         message = r"no vector or matrix of numbers; cube \(\(3, 4, 5\), float64\) is not used"
         with pytest.raises(DataError, match=message):
@@ -335,18 +320,19 @@ class TestHdf5:
 SI = {"type": 164, "units_code": 1, "units_description": "SI", "temp_mode": 1,
       "length": 1.0, "force": 1.0, "temp": 1.0, "temp_offset": 273.15}  # fmt: skip
 MILLIMETRES = {**SI, "units_code": 5, "length": 1e3, "force": 1e3}
+CHANNELS = [SI, uff_function(X, TIME, 1, 8), uff_function(F, TIME, 1, 13, rsp_node=2)]
 
 
 class TestUniversalFile:
     @pytest.mark.parametrize("binary", [0, 1])
     def test_frequency_response(self, tmp_path, binary):
-        path = write_uff(
-            tmp_path / "beam.uff", SI, uff_function(RECEPTANCE, FREQUENCY, 4, 8, binary=binary)
-        )
-        data = read_frequency_response(path, drive="0.2 N")
+        data = self.read(tmp_path, SI, uff_function(RECEPTANCE, FREQUENCY, 4, 8, binary=binary))
         assert data.quantity == "receptance"
         np.testing.assert_allclose(data.response, RECEPTANCE, rtol=1e-11)
         np.testing.assert_allclose(data.frequency_hz, FREQUENCY)
+
+    def read(self, folder, *sets, drive="1 N", **options):
+        return read_frequency_response(write_uff(folder / "a.unv", *sets), drive=drive, **options)
 
     @pytest.mark.parametrize(
         ("numerator", "quantity"), [(8, "receptance"), (11, "mobility"), (12, "accelerance")]
@@ -354,33 +340,27 @@ class TestUniversalFile:
     def test_data_types_and_unit_systems(self, tmp_path, numerator, quantity):
         """Millimetres over millinewtons are metres over newtons."""
         function = uff_function(-1j * RECEPTANCE, FREQUENCY, 4, numerator)
-        path = write_uff(tmp_path / "beam.unv", MILLIMETRES, function)
-        data = read_frequency_response(path, drive="0.2 N", passive=False)
+        data = self.read(tmp_path, MILLIMETRES, function, passive=False)
         assert data.quantity == quantity
         np.testing.assert_allclose(data.response, -1j * RECEPTANCE, rtol=1e-11)
 
     def test_labels_come_first(self, tmp_path):
-        function = uff_function(
-            RECEPTANCE, FREQUENCY, 4, 8, ordinate_axis_units_lab="mm", orddenom_axis_units_lab="N"
-        )
-        data = read_frequency_response(write_uff(tmp_path / "a.uff", SI, function), drive="1 N")
+        units = {"ordinate_axis_units_lab": "mm", "orddenom_axis_units_lab": "N"}
+        data = self.read(tmp_path, SI, uff_function(RECEPTANCE, FREQUENCY, 4, 8, **units))
         np.testing.assert_allclose(data.response, 1e-3 * RECEPTANCE, rtol=1e-11)
 
     def test_directions_turn_the_sign(self, tmp_path):
-        function = uff_function(-RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=-3)
-        data = read_frequency_response(write_uff(tmp_path / "a.uff", SI, function), drive="1 N")
+        data = self.read(tmp_path, SI, uff_function(-RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=-3))
         np.testing.assert_allclose(data.response, RECEPTANCE, rtol=1e-11)
         assert "FRF 1:-Z/2:+Z: sign turned, as its directions say" in data.provenance["notes"]
 
     def test_rotation(self, tmp_path):
         function = uff_function(RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=6, ref_dir=6)
-        inches = {**SI, "units_code": 7, "length": 1 / 0.0254, "force": 1 / 4.4482216152605}
-        path = write_uff(tmp_path / "a.uff", inches, function)
-        data = read_frequency_response(path, drive="1 N m")
+        pound = 4.4482216152605
+        inches = {**SI, "units_code": 7, "length": 1 / 0.0254, "force": 1 / pound}
+        data = self.read(tmp_path, inches, function, drive="1 N m")
         assert data.motion == "rotation"
-        np.testing.assert_allclose(
-            data.response, RECEPTANCE / (4.4482216152605 * 0.0254), rtol=1e-11
-        )
+        np.testing.assert_allclose(data.response, RECEPTANCE / (pound * 0.0254), rtol=1e-11)
 
     def test_several_functions(self, tmp_path):
         functions = [uff_function(k * RECEPTANCE, FREQUENCY, 4, 8, rsp_node=k) for k in (1, 2)]
@@ -391,12 +371,7 @@ class TestUniversalFile:
         np.testing.assert_allclose(data.response, 2 * RECEPTANCE, rtol=1e-11)
 
     def test_time_records(self, tmp_path):
-        path = write_uff(
-            tmp_path / "run.uff",
-            SI,
-            uff_function(X, TIME, 1, 8),
-            uff_function(F, TIME, 1, 13, rsp_node=2),
-        )
+        path = write_uff(tmp_path / "run.uff", *CHANNELS)
         assert_the_run(read_record(path), rtol=1e-10)
 
     def test_units_outside_ascii(self, tmp_path):
@@ -418,24 +393,20 @@ class TestUniversalFile:
     def test_refusal(self, tmp_path):
         function = uff_function(RECEPTANCE, FREQUENCY, 4, 8)
         with pytest.raises(UnitError, match=r"column 'FRF 1:\+Z/2:\+Z' has no unit"):
-            read_frequency_response(write_uff(tmp_path / "a.uff", function), drive="1 N")
-        path = write_uff(tmp_path / "b.uff", {**SI, "length": 39.37}, function)
+            self.read(tmp_path, function)
         with pytest.raises(DataError, match=r"units code 1 means m, a length factor of 1, .* 39"):
-            read_frequency_response(path, drive="1 N")
-        path = write_uff(tmp_path / "c.uff", SI)
+            self.read(tmp_path, {**SI, "length": 39.37}, function)
         with pytest.raises(DataError, match=r"no frequency response or time record .* \[164\]"):
-            read_frequency_response(path, drive="1 N")
-        path = write_uff(tmp_path / "psd.uff", uff_function(abs(RECEPTANCE), FREQUENCY, 2, 8))
+            self.read(tmp_path, SI)
         with pytest.raises(DataError, match=r"data sets \[58\] with function types \[2\]"):
-            read_frequency_response(path, drive="1 N")
+            self.read(tmp_path, uff_function(abs(RECEPTANCE), FREQUENCY, 2, 8))
         path = write_uff(tmp_path / "d.uff", SI, {**function, "binary": 1})
         path.write_bytes(path.read_bytes()[:-40])
         with pytest.raises(DataError, match=r"damaged|cut off|no frequency response"):
             read_frequency_response(path, drive="1 N")
 
     def test_damage_names_its_data_set(self, tmp_path):
-        sets = [SI, uff_function(X, TIME, 1, 8), uff_function(F, TIME, 1, 13, rsp_node=2)]
-        path = write_uff(tmp_path / "run.uff", *sets)
+        path = write_uff(tmp_path / "run.uff", *CHANNELS)
         before, last = path.read_bytes().rsplit(b"    58", 1)
         path.write_bytes(before + b"    58" + last.replace(b".", b"x"))
         with pytest.raises(DataError, match=r"data set 3 of 3 \(type 58\) .* is damaged: "):
@@ -647,16 +618,10 @@ class TestHostileFiles:
         assert_the_run(record)
         assert "struct (struct<a: int64>) is not used" in repr(record)
 
-    @pytest.mark.parametrize(
-        "content",
-        [
-            "[" * 100_000,
-            '{"a": ' * 50_000,
-            "1" * 10_000,
-            '{"a": 1}',
-            '{"time [s]":[0,1],"x [m]":[0,1],"F [N]":[0,1],"F [N]":[1,2]}',
-        ],
-    )
+    @pytest.mark.parametrize("content", [
+        "[" * 100_000, '{"a": ' * 50_000, "1" * 10_000, '{"a": 1}',
+        '{"time [s]":[0,1],"x [m]":[0,1],"F [N]":[0,1],"F [N]":[1,2]}',
+    ])  # fmt: skip
     def test_json_that_is_no_table(self, tmp_path, content):
         (tmp_path / "a.json").write_text(content)
         with pytest.raises(DataError):
@@ -715,17 +680,12 @@ class TestDictionaries:
         np.savez(tmp_path / "run.npz", **named)
         assert_the_run(read_record(tmp_path / "run.npz"))
         np.save(tmp_path / "run.npy", np.column_stack([TIME, X, F]))
-        columns = {
-            "time": "data[:,0] [s]",
-            "displacement": "data[:,1] [m]",
-            "force": "data[:,2] [N]",
-        }
-        assert_the_run(read_record(tmp_path / "run.npy", columns=columns))
+        names = {"time": "data[:,0] [s]", "displacement": "data[:,1] [m]", "force": "data[:,2] [N]"}
+        assert_the_run(read_record(tmp_path / "run.npy", columns=names))
         rows = np.array(list(zip(TIME, X, F, strict=True)), dtype=[(n, "f8") for n in "txF"])
         np.save(tmp_path / "run.npy", rows)
-        assert_the_run(
-            read_record(tmp_path / "run.npy", time="t [s]", displacement="x [m]", force="F [N]")
-        )
+        names = {"time": "t [s]", "displacement": "x [m]", "force": "F [N]"}
+        assert_the_run(read_record(tmp_path / "run.npy", columns=names))
 
     def test_sdypy_there_and_back(self):
         record = Record(TIME, displacement=X, force=F)
@@ -802,11 +762,7 @@ def test_missing_packages_are_named(tmp_path, monkeypatch, module, extra, name, 
 def test_errors_name_the_level(tmp_path):
     levels = [{"f": FREQUENCY, "u": [1.0, 1.0, v], "H": RECEPTANCE} for v in (1.0, -1.0)]
     savemat(tmp_path / "a.mat", {"s": np.array(levels, dtype=object)})
-    columns = {
-        "frequency": {"column": "s[*].f", "unit": "Hz"},
-        "drive": {"column": "s[*].u", "unit": "N"},
-        "response": {"column": "s[*].H", "unit": "m/N"},
-    }
+    columns = {"frequency": "s[*].f [Hz]", "drive": "s[*].u [N]", "response": "s[*].H [m/N]"}
     with pytest.raises(DataError, match=r"a.mat, level s\[1\], index 2, column .*: found -1"):
         read_frequency_response(tmp_path / "a.mat", columns=columns)
 
