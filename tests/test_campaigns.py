@@ -365,11 +365,11 @@ def test_command_line(tmp_path, run):
     done = run("campaign", str(path), "--jobs", "1", "--report", str(report), "--json")
     assert json.loads(done.out)["to_do"] == ["d000", "d001", "d002", "d003"]
     assert b"Population: f_max" in report.read_bytes()
+    assert run("campaign", str(path), "--report", "campaign.pdf").status == 0
+    assert Path("campaign.pdf").read_bytes().startswith(b"%PDF")
     as_waves = path.read_text().replace("response", "record") + '[output]\nfolder = "waves"\n'
     path.write_text(as_waves)
     waves = run("campaign", str(path))
     assert waves.status == 3
     assert "the table says why, such as DataError: " in waves.err
     assert "d000_r0.csv: no motion found" in waves.err
-    assert run("campaign", str(path), "--report", "campaign.pdf").status == 0
-    assert Path("campaign.pdf").read_bytes().startswith(b"%PDF")
