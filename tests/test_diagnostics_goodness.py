@@ -207,8 +207,6 @@ class TestOutliers:
         found = judge(named).suspicious
         assert {point.row for point in found} == {7, 20}
         (first,) = (point for point in found if point.row == 7)
-        assert first.level == "run 7"
-        assert first.amplitude == amplitudes(data)[7]
         assert first.deviation > 5.0
         assert "1 Hz, 1.01 mm, level run 7 lies" in str(first)
 

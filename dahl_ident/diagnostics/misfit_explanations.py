@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import comb
-from typing import Any
 
 import numpy as np
 from scipy import special
@@ -45,9 +44,6 @@ class SuspiciousPoint:
 
     row: int  # its index in the table
     name: str  # in words: frequency, level, harmonic, run
-    frequency_hz: float
-    amplitude: float
-    level: Any  # label of the level, None if the table has none
     deviation: float  # distance from the fit to the others, in standard deviations
     p_value: float  # probability that the worst of all points deviates as far by noise alone
 
@@ -58,14 +54,11 @@ class SuspiciousPoint:
 def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[SuspiciousPoint, ...]:
     """Return the suspicious points, the most deviant first."""
     deviant = _outliers(optimum) if optimum.loss != "linear" else _suspicious(optimum, space)
-    data, amplitude = optimum.problem.data, optimum.problem.stiffness_data.amplitude
-    names = row_names(data, [row for row, *_ in deviant])
-    points = []
-    for (row, deviation, p), name in zip(deviant, names, strict=True):
-        level = None if data.level is None else data.level[row].item()
-        f, A = float(data.frequency_hz[row]), float(amplitude[row])
-        points.append(SuspiciousPoint(row, name, f, A, level, deviation, p))
-    return tuple(points)
+    names = row_names(optimum.problem.data, [row for row, *_ in deviant])
+    return tuple(
+        SuspiciousPoint(row, name, deviation, p)
+        for (row, deviation, p), name in zip(deviant, names, strict=True)
+    )
 
 
 def _suspicious(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float, float]]:

@@ -217,10 +217,9 @@ class Profiler:
         for edge in self._edges:
             starts.append(np.where(held, starts[0], edge))
             rows.append(rows[0])
-        for chart in self._microslip_charts:
-            valley, applies = _along_valley(chart, index, theta, change, self._smallest)
-            starts.append(valley[applies])
-            rows.append(np.flatnonzero(applies))
+        for edge in self._edges:
+            starts.append(np.where(held, starts[0], edge))
+            rows.append(rows[0])
         row = np.concatenate(rows)
         return self._constrained(index[row], np.concatenate(starts)).lowest(row)
 

@@ -83,7 +83,6 @@ class RecordBand:
 class RecordGoodness(Goodness):
     """Residuals of all records: their size, where they are largest, and their correlation."""
 
-    unexplained_share: float = 0.0  # variance of the residuals over that of the measured output
     # root mean square over that of the output, at the drive's frequencies where residuals are
     # weighted by their spectrum
     rms_in_band: float = 0.0
@@ -96,7 +95,7 @@ class RecordGoodness(Goodness):
     def details(self) -> list[str]:
         """The numbers as text."""
         return [
-            f"unexplained share of variance {self.unexplained_share:.3g} "
+            f"unexplained share of variance {self.rms_misfit**2:.3g} "
             f"({percent(self.rms_misfit)} rms)",
             f"residuals {self.rms:.3g} rms; {self.worst}",
             f"correlation of neighbouring residuals {self.correlation:.2f}",
@@ -141,7 +140,6 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     products = sum(float(e[1:] @ e[:-1]) for e in residuals)
     return RecordGoodness(
         share**0.5,
-        unexplained_share=share,
         rms_in_band=in_band**0.5,
         rms=rms,
         worst_record=number,
@@ -347,7 +345,7 @@ class RecordAssessment(Assessment):
             "records": len(self.problem.records),
             "samples": self.problem.n_samples,
             "effective_samples": self.errors.effective,
-            "share_of_variance_left": self.goodness.unexplained_share,
+            "share_of_variance_left": self.goodness.rms_misfit**2,
         }
 
     @property
@@ -400,7 +398,7 @@ class RecordAssessment(Assessment):
             covariance = self.covar[:count, :count] / np.outer(slopes, slopes)
         unknown = ~np.isfinite(covariance)
         covariance[unknown] = np.where(np.eye(count)[unknown] > 0.0, _UNKNOWN, 0.0)
-        share = (0.5 * self.goodness.unexplained_share) ** 0.5 if self.exceeds_noise else _POSITIVE
+        share = 0.5**0.5 * self.goodness.rms_misfit if self.exceeds_noise else _POSITIVE
         optimum = replace(
             self.optimum,
             source=problem,

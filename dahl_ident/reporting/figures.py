@@ -71,7 +71,7 @@ def _of_records(fit: FitResult) -> Iterator[Picture]:
     """Yield the figures of the record that a fit describes worst."""
     worst = fit.goodness.worst_record - 1
     of_record = f" of record {worst + 1}, which is described worst" if len(fit.data) > 1 else ""
-    share = percent(fit.goodness.unexplained_share**0.5)
+    share = percent(fit.goodness.rms_misfit)
     draw_residuals = partial(fit.plot_residuals, record=worst)
     figures: dict[str, tuple[str, Callable[[], Any]]] = {
         "time": (f"Measured and fitted {fit.problem.output}", partial(fit.plot_fit, record=worst)),
