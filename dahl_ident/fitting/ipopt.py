@@ -270,7 +270,7 @@ class _Descent:
             constrained = any(self.relations.equal) or any(ends[0].active)
             if begin.success and not ends[0].failure and not constrained:
                 return ends[0]
-        starts = np.clip(starts_of(self.problem)[:_MOST_STARTS], *self.problem.bounds())
+        starts = np.clip(starts_of(self.problem, _MOST_STARTS), *self.problem.bounds())
         ends += [self.descend(theta) for theta in starts if np.isfinite(self.at(theta).cost)]
         if not ends:
             raise FitError("no start has a steady response in every row; give another start")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -14,19 +14,12 @@ from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise, minimise_by_scipy
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, agreed_scale
-from dahl_ident.fitting.record_start import (
-    MORE_STARTS,
-    STARTS,
-    alternatives,
-    record_starts,
-    started_at,
-)
+from dahl_ident.fitting.record_start import alternatives, record_starts, started_at
 from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
 _SHORT = {"force": 8192, "motion": 4096}  # samples of a first search of a long record
-_COMPARED = 8  # steps after which starts of a driven motion are compared
 _LAGS = 20  # of the residuals' correlations
 _CORRELATED = 5.0  # standard deviations of the statistic of white noise that reject it
 _IDLE = 0.5  # standard error of a logarithm above which a parameter has hardly an effect
@@ -47,7 +40,6 @@ SLOW = 0.5  # correlation of neighbouring residuals above which they are weighte
 EXACT = 1e-12  # unexplained share of variance that is rounding
 LOOSE = 1e4  # factor of the step at which a search of a long record has converged
 ROUGH = 15  # steps after which the limits of first states are taken anew
-_LOWER = 0.01  # relative fall of the cost from which an end of another search counts as lower
 SETTLED = 0.03  # step in standard errors that is negligible
 _HINDERED = 0.2  # the same where the cost does not fall along a step, as across the kinks of a law
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is significant
@@ -334,8 +326,7 @@ class RecordSearch:
         self, problem: RecordProblem, values: list[float], start: Mapping[str, float], steps: int
     ) -> Minima:
         """Return the end of a search from values of the model, changed to those in `start`."""
-        starts = _changed(started_at(problem, values)[None], problem, start)
-        return self.best(problem, starts, steps)
+        return self.first(problem, [_changed(started_at(problem, values), problem, start)], steps)
 
     def optimum(self, problem: RecordProblem, end: Minima) -> Optimum:
         """Return the optimum at the end of a search, with assumed exponents fixed there."""
@@ -395,14 +386,13 @@ class RecordSearch:
         return end
 
     def searched(self, problem: RecordProblem, start: Mapping[str, float]) -> Minima:
-        """Return the best end of searches from automatic starts, with the values in `start`."""
-        try:
-            best = self.best(problem, _changed(record_starts(problem), problem, start))
-        except FitError:
-            more = record_starts(problem, MORE_STARTS)[STARTS:]
-            if not len(more):
-                raise
-            best = self.best(problem, _changed(more, problem, start))
+        """Return the end of a search from the automatic start, with the values in `start`.
+
+        The residuals of a right end are white noise, and every parameter has an effect there;
+        otherwise the search goes on from other values.
+        """
+        starts = (_changed(values, problem, start) for values in record_starts(problem))
+        best = self.first(problem, starts, STEPS)
         several = any(len(element.starts) > 1 for element in problem.with_memory)
         if several or _has_idle(problem, best) or not _is_white(problem, best):
             return self.elsewhere(problem, best)
@@ -456,38 +446,19 @@ class RecordSearch:
         step[relative] = np.log(np.clip(1.0 + step[relative], *_ADAPTED))
         return predicted, theta + step
 
-    def best(self, problem: RecordProblem, starts: FloatArray, steps: int = STEPS) -> Minima:
-        """Return the end of a search from the start that is lowest after a few steps.
-
-        No further start is tried once the residuals are white noise. If a parameter has lost its
-        effect at the end, searches from the other starts continue as long as they end lower.
-        """
-        first_ends = list[Minima]()
+    def first(self, problem: RecordProblem, starts: Iterable[FloatArray], steps: int) -> Minima:
+        """Return the end of a search from the first start whose motion is finite."""
         for start in starts:
-            end = self.minimise(problem, problem.to_search(start)[None], _COMPARED)
+            end = self.descend(problem, problem.to_search(start), steps)
             if np.isfinite(end.cost[0]):
-                first_ends.append(end)
-                if len(starts) == 1 or _is_white(problem, end):
-                    first_ends = [end]
-                    break
-        if not first_ends:
-            predict = argument("output", "force", option="predicted")
-            imposed = f", or, if the exciter imposes the motion, fit the force: {predict}"
-            raise FitError(
-                "from no start does the model give a finite motion; give "
-                f"{argument('start')}, or check the units"
-                + (imposed if problem.output == "motion" else "")
-            )
-        first_ends.sort(key=lambda end: float(end.cost[0]))
-        best = self.descend(problem, first_ends[0].theta[0], steps)
-        for begin in first_ends[1:]:
-            if not _has_idle(problem, best):
-                break
-            end = self.descend(problem, begin.theta[0], steps)
-            if not end.cost[0] < best.cost[0] * (1.0 - _LOWER):
-                break
-            best = end
-        return best
+                return end
+        predict = argument("output", "force", option="predicted")
+        imposed = f", or, if the exciter imposes the motion, fit the force: {predict}"
+        raise FitError(
+            "from no start does the model give a finite motion; give "
+            f"{argument('start')}, or check the units"
+            + (imposed if problem.output == "motion" else "")
+        )
 
 
 def unexplained(problem: RecordProblem, end: Minima) -> float:
@@ -521,12 +492,10 @@ def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
     return np.concatenate([values, held.to_values(end.theta[0])])
 
 
-def _changed(starts: FloatArray, problem: RecordProblem, start: Mapping[str, float]) -> FloatArray:
-    """Return the starts with the values in `start`."""
-    for name, value in start.items():
-        if name in problem.names:
-            starts[:, problem.names.index(name)] = value
-    return starts
+def _changed(values: FloatArray, problem: RecordProblem, start: Mapping[str, float]) -> FloatArray:
+    """Return the values of a problem with those in `start`."""
+    given = zip(problem.names, values.tolist(), strict=True)
+    return np.array([start.get(name, value) for name, value in given])
 
 
 def _is_white(problem: RecordProblem, end: Minima) -> bool:

@@ -25,22 +25,20 @@ _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
 _SIGNED = np.geomspace(0.03, 30.0, 7)  # rates over the inverse of the largest displacement
 _MOST_SAMPLES = 8192  # most samples of a record in the scan
 _COMBINATIONS = 100  # most nodes of the grid: each takes nearly as long as a step of a search
-STARTS = 4
-"""Number of starts that are tried first."""
-MORE_STARTS = 24
-"""Number if no motion from those is finite, such as with too stiff a contact."""
+_STARTS = 24  # most starts, as long as no motion is finite, such as with too stiff a contact
 _LOADS = (0.0, 0.9, -0.9)  # of all springs at a first sample: none, or nearly slipping
 _DECAY = 1e-3  # least amplitude in the spectrum of a free decay, over the largest
 _DRIVE_BAND = 1e-5  # least power of the drive in its band, over the largest
 
 
-def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
-    """Return at most `count` starts, best first, as values of the problem, (S, P).
+def record_starts(problem: RecordProblem) -> Iterator[FloatArray]:
+    """Yield starts, best first, as values of the problem, (P,).
 
     Values given to free parameters are kept.
     """
     with np.errstate(all="ignore"):  # laws far off may overflow; such combinations are left out
-        return _Scan(problem).starts(count)
+        starts = _Scan(problem).starts()
+    return (started_at(problem, values) for values in starts)
 
 
 def alternatives(problem: RecordProblem, values: FloatArray) -> Iterator[tuple[int, float]]:
@@ -132,8 +130,8 @@ class _Scan:
         output = problem.measured[number]
         return _History(x[part], v[part], a[part], force[part], output[part], record.time[part])
 
-    def starts(self, count: int) -> FloatArray:
-        """Return the best starts of the scan."""
+    def starts(self) -> list[list[float]]:
+        """Return the free values at the best starts that differ, passive ones first."""
         elements = self.problem.model.elements
         choices = [list(product(*self.grids(e))) for e in elements]
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
@@ -152,16 +150,11 @@ class _Scan:
         if not begin:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
             begin = [_Start(0.0, values, passive=True)]
-        begin.sort(key=lambda start: start.misfit)
-        ranks = {True: 0, False: 0}
-        kept: dict[tuple[int, bool], list[float]] = {}
-        for start in begin:
-            rank = ranks[start.passive]
-            if rank < count and all(_differ(start.values, other) for other in kept.values()):
-                kept[rank, not start.passive] = start.values  # in turn, passive ones first
-                ranks[start.passive] += 1
-        chosen = [kept[rank] for rank in sorted(kept)][:count]
-        return np.array([started_at(self.problem, values) for values in chosen])
+        chosen = list[list[float]]()
+        for start in sorted(begin, key=lambda start: (not start.passive, start.misfit)):
+            if len(chosen) < _STARTS and all(_differ(start.values, other) for other in chosen):
+                chosen.append(start.values)
+        return chosen
 
     def grids(self, element: Element) -> list[list[float]]:
         """Return values of an element's parameters at which its force is to be computed.
@@ -314,6 +307,7 @@ class _Scan:
         return np.where(_DRIVE_BAND * np.max(F**2) < F**2, X / np.maximum(F, 1e-300), 0.0)
 
 
+@np.errstate(all="ignore")  # as above
 def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
     """Return all values of a problem from the model's free ones: with states and offsets."""
     full = np.zeros(len(problem.parameters))

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -126,12 +127,12 @@ def _solve_table(
     return optimum
 
 
-def starts_of(problem: Problem) -> FloatArray:
-    """Return the search coordinates of global starts."""
+def starts_of(problem: Problem, most: int) -> FloatArray:
+    """Return the search coordinates of at most as many global starts, best first, (S, P)."""
     any_problem: Any = problem
     if problem.kind == "records":
-        return np.asarray(any_problem.to_search(record_starts(any_problem)))
-    return global_starts(any_problem).theta
+        return np.array([problem.to_search(v) for v in islice(record_starts(any_problem), most)])
+    return global_starts(any_problem).theta[:most]
 
 
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
