@@ -543,3 +543,21 @@ def test_a_driven_motion_shows_the_damper_that_its_model_lacks():
     assert not fit.trusted
     right = di.fit(record, plant + di.Damper())
     assert right.trusted, right.verdict
+
+
+def test_friction_that_never_turns_in_one_record_is_judged_with_another_in_which_it_does():
+    t = np.arange(100) / 100.0
+    sliding = di.Record(t, displacement=0.05 * t, force=np.ones(100))
+    x = 2e-3 * np.sin(12.0 * t)
+    turning = di.Record(t, displacement=x, force=di.Dahl(1.0, 1e5).force(x) - 0.5 * 144.0 * x)
+    found = di.fit([sliding, turning], di.Dahl(1.0, 1e5, alpha=1.0) + di.Mass(), throw=False)
+    mass = found.params["mass"]
+    assert abs(mass.value - 0.5) < 2.0 * mass.stderr < 0.2
+
+
+def test_a_motion_far_larger_than_measured_asks_for_other_values():
+    t = np.arange(100) / 100.0
+    x = 2e-3 * np.sin(12.0 * t)
+    record = di.Record(t, displacement=x, force=di.Dahl(1.0, 1e5).force(x) - 0.5 * 144.0 * x)
+    found = di.fit(record, di.Dahl(0.01, alpha=1.0) + di.Mass(0.1), throw=False)
+    assert "at rest it would miss less. Check the values given, or give initial" in found.verdict

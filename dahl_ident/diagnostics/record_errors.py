@@ -190,15 +190,14 @@ def _functions(fit: LinearFit, number: int) -> dict[str, FloatArray]:
     step = _FORCE_STEP * float(problem.unit_sizes((1, 0, 0))[number])
 
     def moved(force: FloatArray) -> FloatArray:
-        driven = problem.driven_more({number: step * force})
+        if not (size := np.std(force)):
+            return np.zeros(plain.shape)  # as many columns as in other records
+        driven = problem.driven_more({number: step / size * force})
         return driven.predict(values, number, derivatives=False).output - plain
 
     forces = _forces(problem, values, *in_band(record, plain)[:2])
     return {
-        name: np.column_stack(
-            [moved(wave / np.std(wave)) for wave in waves.T if np.std(wave) > 0.0]
-        )
-        for name, waves in forces.items()
+        name: np.column_stack([moved(wave) for wave in waves.T]) for name, waves in forces.items()
     }
 
 
@@ -220,7 +219,7 @@ def _forces(
             lengths |= {float(knee) for knee in element.knee([np.asarray(a) for a in at])}
     if not friction.any():
         friction = heading
-    lengths = {min(length, farthest) for length in lengths if length > 0.0} or {farthest}
+    distances = [min(length, farthest) for length in sorted(lengths) if length > 0.0] or [farthest]
     ahead = heading * friction / (np.abs(friction).max() or 1.0)
     speed, position = v / (np.abs(v).max() or 1.0), (x - x.mean()) / (np.ptp(x) or 1.0)
     width = _FRICTION_LEVELS[1] - _FRICTION_LEVELS[0]
@@ -232,7 +231,7 @@ def _forces(
         term = 0.5 * (slopes[1:] + slopes[:-1]) * steps[:, None]
         zero = np.zeros(slopes.shape[1])
         return np.column_stack(
-            [linear_recursion(np.exp(-np.abs(steps) / d), term, zero) for d in sorted(lengths)]
+            [linear_recursion(np.exp(-np.abs(steps) / d), term, zero) for d in distances]
         )
 
     damping = np.column_stack([speed, speed * np.abs(speed), speed**3])

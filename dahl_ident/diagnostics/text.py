@@ -280,7 +280,15 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "plant would drive itself, and no steady motion is there.",
     "describing_function": "The force was held, but the describing function predicts the motion: "
     "{why}.",
-    "records_not_described": "The model does not describe the records ({rms:percent} rms misfit).",
+    "records_not_described": lambda rms: (
+        f"The model does not describe the records ({percent(rms)} rms misfit)"
+        + (
+            ": at rest it would miss less. Check the values given, or give initial ones, "
+            f"{argument('start', {'f_max': 0.1})}."
+            if rms > 1.0
+            else "."
+        )
+    ),
     "motion_may_be_imposed": lambda: (
         "If the exciter imposed the motion, fit the force instead "
         f"({argument('output', 'force', option='predicted')}): what it moves hardly depends on the "
