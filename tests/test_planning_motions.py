@@ -137,6 +137,24 @@ class TestPlan:
             # of 30 experiments the error of a standard deviation is 13 %
             assert plan.expected[name].after == pytest.approx(error, rel=0.33)
 
+    def test_an_exponent_that_nobody_gave_is_as_unknown_as_in_a_fit(self):
+        rng, law = np.random.default_rng(0), di.Dahl(0.1, 30.0)
+
+        def measured(motion, seconds):
+            time = np.arange(round(seconds * RATE)) / RATE
+            x = motion.displacement(time)
+            force = law.force(x) + 2e-4 * rng.standard_normal(time.size)
+            return di.Record(time, displacement=x, force=force)
+
+        small = measured(Multisine(0.5, 2.0, 1e-3), 10.0)
+        earlier, bench = di.fit(small, di.Dahl()), {**BENCH, "time": 20.0}
+        plan = di.plan(earlier, limits=bench, candidates=FEW[:1], sample_rate=RATE, draws=6)
+        (step,) = plan.steps
+        both = di.fit([small, measured(step.motion, step.seconds - 1.0)], di.Dahl())
+        for name in (*TRUTH, "alpha"):
+            u = both.params[name].stderr / both.params[name].value
+            assert plan.expected[name].after == pytest.approx(u, rel=0.3)
+
     def test_earlier_records_shorten_it(self):
         time = np.arange(800) / RATE
         x = FEW[0].displacement(time)

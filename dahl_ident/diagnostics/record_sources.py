@@ -168,6 +168,7 @@ class FixedExponent:
     # (P, P): covariance of the estimate due to the exponent's uncertainty, or due to its distance
     # from the value that the records indicate, whichever is larger
     contribution: FloatArray
+    others: FloatArray  # (P,): changes of the values per change of the logarithm
     assumed: bool  # whether the fit assumes it, because the user stated none
 
     @property
@@ -208,7 +209,16 @@ def fixed_exponents(
                 ratio, ratio_std = _searched_ratio(fit, p.name, sources) or (ratio, ratio_std)
         exponents.append(
             FixedExponent(
-                p.name, p.unit, value, limits, std, ratio, ratio_std, covariance, p.assumed
+                p.name,
+                p.unit,
+                value,
+                limits,
+                std,
+                ratio,
+                ratio_std,
+                covariance,
+                freed.others,
+                p.assumed,
             )
         )
     return tuple(exponents)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, IntArray, finite_array
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.contributions import NOISE, RUNS
+from dahl_ident.diagnostics.contributions import NOISE, RUNS, excess
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.driven_motion import Steady
@@ -268,26 +268,42 @@ def _of_records(
             "responses, and of records whose force was predicted: give the model with "
             f"{argument('ranges')}"
         )
-    parameters = tuple(problem.free)
-    space, P = Space(parameters), len(parameters)
+    free, P = tuple(problem.free), len(problem.free)
+    space, best = Space(free), np.asarray(fit.optimum.values)[:P]
+    slope = space.slopes(best)
     if values is None:
-        best = np.asarray(fit.optimum.values)[:P]
-        slope = space.slopes(best)
         covariance = np.asarray(fit.covar)[:P, :P] / np.outer(slope, slope)
         if not np.isfinite(covariance).all():
             raise ValidationError("plan: the fit does not determine its parameters; give the model")
-        theta = _drawn(rng, space.to_search(best), covariance, draws, parameters)
     else:
         posterior = space.to_search(values[:, :P])
         covariance = np.atleast_2d(np.cov(posterior, rowvar=False))
-        theta = _within(posterior[rng.integers(len(posterior), size=draws)], parameters)
+    exponents = fit.errors.assumed
+    assumed = tuple(exponent.name for exponent in exponents)
+    model = problem.model.with_free(assumed)
+    parameters = tuple(p for p in model.parameters if p.free)
+    # what a standard deviation of each exponent does to the others and to its logarithm
+    others = np.array([p.std * p.others[:P] / slope for p in exponents]).reshape(-1, P)
+    root = np.vstack([others.T, np.diag([p.std for p in exponents])])
+    joint = root @ root.T
+    joint[:P, :P] += excess(covariance, joint[:P, :P])
+    names = [*(p.name for p in free), *assumed]
+    order = [names.index(p.name) for p in parameters]
+    joint = joint[np.ix_(order, order)]
+    if values is None:
+        centre = _among(parameters, names[:P], space.to_search(best))
+        theta = _drawn(rng, centre, joint, draws, parameters)
+    else:
+        drawn = posterior[rng.integers(len(posterior), size=draws)]
+        theta = _within(_among(parameters, names[:P], drawn), parameters)
     return Knowledge(
-        problem.model,
+        model,
         parameters,
         theta,
         _stated(source, parameters),
-        _repeated(np.linalg.inv(covariance), draws),
-        np.zeros(P),
+        _repeated(np.linalg.inv(joint), draws),
+        np.zeros(len(parameters)),
+        assumed,
         motion=problem.records[0].motion,
         sample_noise=float(np.std(np.concatenate(fit.residuals))),
     )
