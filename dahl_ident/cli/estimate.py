@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD, changed, refuse, write_output
+from dahl_ident.cli.console import STANDARD, changed, write_output
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.options import (
     General,
@@ -360,9 +360,6 @@ def report(
     finish(worst(fits))
 
 
-_CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
-
-
 @dataclass(frozen=True)
 class Sampling:
     """Sampling; the options of ``posterior``."""
@@ -408,12 +405,6 @@ class Sampling:
         steady = None if self.steady == "exact" else self.steady
         return {**keywords, "steady": steady, "progress": sys.stderr.isatty()}
 
-    def check(self) -> None:
-        """Refuse options of a chain with --method grid."""
-        of_chain = [name for name in changed(self) if name in _CHAIN and name != "seed"]
-        if self.method == "grid":
-            refuse(of_chain, "together with --method grid, which runs no chain; leave one out")
-
 
 @with_option_groups
 def sample(
@@ -437,7 +428,6 @@ def sample(
     laws.run()
     writing.check([report], files, json=general.json)
     check_reports(report)
-    sampling.check()
     keywords = {**model.keywords(), **sampling.keywords()}
     data = reading.read_any(files, channels, record=record)
     try:
