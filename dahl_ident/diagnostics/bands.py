@@ -102,8 +102,8 @@ def prediction_error(
     spread = np.einsum("kni,kl,lni->ni", by_variance, state.variances_covariance, by_variance)
     dof = satterthwaite(total, spread)
     if errors.by_runs is not None:  # a new run scatters about the mean of the runs
-        mean = _diagonal(by_theta @ errors.by_runs.covariance @ by_theta.swapaxes(1, 2))
-        runs = errors.by_runs.runs
+        mean = _diagonal(by_theta @ errors.by_runs @ by_theta.swapaxes(1, 2))
+        runs = len(errors.problem.data.runs)
         dof = no_narrower(dof, total, (1 + runs * of_a_test) * mean, runs)
     covariance[~basis.holds(by_theta).all(axis=1)] = np.inf
     return PredictionError(X @ state.predicted, covariance, dof)

@@ -497,10 +497,10 @@ def _candidates(
     if problem.response is not None:
         reasons["asymmetry"] = _even(optimum)
         reasons["speed"] = _falling_force(optimum)
-        least = least_misfit(optimum)
-        helps = least is not None and least < FAR_LESS * fitted.misfit
-        would_leave = f"parallel Jenkins elements would leave {percent(least or 0.0)}"
-        reasons["masing"] = f"{would_leave} of the fundamental" if helps else ""
+        least, reasons["masing"] = least_misfit(optimum), ""
+        if least is not None and least < FAR_LESS * fitted.misfit:
+            would_leave = f"would leave {percent(least)} of the fundamental"
+            reasons["masing"] = f"parallel Jenkins elements {would_leave}"
     exponent_is_assumed = any(p.assumed for e in model.elements for p in e.parameters)
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
         alternatives = [offered[name] for _, offered in offers if name in offered]

@@ -28,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -87,13 +86,6 @@ _DETERMINED = 1e-10  # least singular value of derivatives, of the largest, that
 _AS_STATED = 1e-6  # relative rise of the noise's variance up to which it is as stated
 
 
-class RunJackknife(NamedTuple):
-    """The covariance of the estimate from the scatter between runs alone (the jackknife)."""
-
-    covariance: FloatArray  # (Q, Q): of theta, by leaving out each run
-    runs: int
-
-
 @dataclass(frozen=True)
 class ErrorModel(ErrorContributions):
     """The estimate, and its covariance by every source of error."""
@@ -111,7 +103,8 @@ class ErrorModel(ErrorContributions):
     # (2, count, Q, Q): covariance of theta by each variance at unit size, with the exponents
     # estimated, and with exact ones
     units: FloatArray
-    by_runs: RunJackknife | None
+    # (Q, Q): covariance of theta from leaving out each run; None with a single run
+    by_runs: FloatArray | None
 
     @property
     def theta(self) -> FloatArray:
@@ -137,11 +130,6 @@ class ErrorModel(ErrorContributions):
     def distinguishes_noise(self) -> bool:
         """Whether there are enough residuals to distinguish a model error from noise."""
         return self.problem.n_nonzero - len(self.names) + len(self.assumed) >= _LEAST_DOF
-
-    @property
-    def labels(self) -> list[str]:
-        """The name of each variance's source."""
-        return [NOISE] * self.state.model.noises + [source.name for source in self.sources]
 
     @cached_property
     def values(self) -> Mapping[str, float]:
@@ -185,7 +173,8 @@ class ErrorModel(ErrorContributions):
         if source == EXPONENT:
             slopes = slopes - exact
         elif source is not None:
-            slopes = exact * [name == source for name in self.labels]
+            labels = [NOISE] * self.state.model.noises + [source.name for source in self.sources]
+            slopes = exact * [name == source for name in labels]
         spread = float(slopes @ self.state.variances_covariance @ slopes)
         if TESTS in sizes:
             spread += 2.0 * sizes[TESTS] ** 2 / (self.tests - 1)
@@ -193,8 +182,8 @@ class ErrorModel(ErrorContributions):
         dof = float(satterthwaite(np.asarray(total), np.asarray(spread)))
         if self.by_runs is None or source is not None:
             return dof
-        of_runs = float(direction @ self.by_runs.covariance @ direction)
-        return float(no_narrower(dof, total, of_runs, self.by_runs.runs))
+        of_runs = float(direction @ self.by_runs @ direction)
+        return float(no_narrower(dof, total, of_runs, len(self.problem.data.runs)))
 
     @cached_property
     def at_estimate(self) -> Optimum:
@@ -405,7 +394,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     by_runs = None
     if estimate.regular and len(problem.data.runs or ()) > 1:
         runs = grouped_rows(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
-        by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
+        by_runs = estimate.jackknife(runs)
     return ErrorModel(
         optimum,
         problem,

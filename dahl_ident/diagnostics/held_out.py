@@ -82,10 +82,6 @@ class HeldOut:
         """Deviations over their standard deviations, shape (r, 2)."""
         return np.asarray(np.abs(self.deviation) / self.std)
 
-    def without(self, test: int) -> FloatArray:
-        """Return the scores of all other tests."""
-        return np.asarray(self.scores[self.test != test].ravel())
-
 
 def band_factor(scores: FloatArray, dof: FloatArray, level: float) -> FloatArray:
     """Return the half width of a band over the standard deviation of a test.
@@ -199,7 +195,7 @@ def cross_validation(left_out: HeldOut | None) -> CrossValidation | None:
     width = np.empty(left_out.std.shape)
     for test in np.unique(left_out.test).tolist():
         rows = left_out.test == test
-        k = band_factor(left_out.without(test), left_out.dof[rows], CONFIDENCE)
+        k = band_factor(left_out.scores[~rows].ravel(), left_out.dof[rows], CONFIDENCE)
         width[rows] = k * left_out.std[rows]
     known = np.isfinite(width).all(axis=1)
     if not known.any():

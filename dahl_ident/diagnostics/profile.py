@@ -277,7 +277,7 @@ class Profiler:
         lowest.cost[:] = np.inf
 
         def evaluate(at: FloatArray, which: IntArray | None) -> Quadratic:
-            cost, gradient, hessian = self._quadratic(at)
+            cost, gradient, hessian = self._searched.quadratic(at, self._scale, self._loss)
             rows = np.arange(S) if which is None else which
             lower = ~(cost > lowest.cost[rows])
             theta[rows[lower]] = at[lower]
@@ -306,17 +306,14 @@ class Profiler:
         change = (slope * step).sum(axis=1)
         return ends, Quadratic(lowest.cost + change, lowest.gradient + bend, lowest.hessian)
 
-    def _quadratic(self, theta: FloatArray) -> Quadratic:
-        at: Quadratic = self._searched.quadratic(theta, self._scale, self._loss)
-        return at
-
     @cached_property
     def _least_cost(self) -> float:
         return self._optimum.cost / self._scale**2
 
     @cached_property
     def _at_optimum(self) -> Quadratic:
-        cost, gradient, hessian = self._quadratic(self._optimum.theta[None])
+        theta = self._optimum.theta[None]
+        cost, gradient, hessian = self._searched.quadratic(theta, self._scale, self._loss)
         return Quadratic(cost[0], gradient[0], hessian[0])
 
     @cached_property
