@@ -20,6 +20,7 @@ from benchmarks.motion_oracles import (
 )
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
+from tests.histories import jenkins_force
 
 Wave = Callable[[float], float]
 
@@ -159,13 +160,10 @@ def unknown_slips(seed: int) -> Case:
     f, phase = np.exp(rng.uniform(np.log(0.4), np.log(4.0), 4)), 2.0 * np.pi * rng.random(4)
     x = np.sin(2.0 * np.pi * np.outer(t, f) + phase).sum(axis=1)
     x *= 1e-3 / np.abs(x).max()
-    d = 3e-5 * np.cumprod(np.exp(rng.uniform(np.log(1.5), np.log(3.0), count)))
+    d = np.asarray(3e-5 * np.cumprod(np.exp(rng.uniform(np.log(1.5), np.log(3.0), count))))
     k = 0.1 * rng.dirichlet(np.full(count, 3.0)) / d
-    force, springs = np.zeros(samples), np.zeros(count)
-    for i, step in enumerate(np.diff(x), 1):
-        springs = np.clip(springs + k * step, -k * d, k * d)
-        force[i] = springs.sum()
-    record = di.Record(t, displacement=x, force=noisy(force, 5e-3, seed))
+    force = noisy(jenkins_force(x, k, d), 5e-3, seed)
+    record = di.Record(t, displacement=x, force=force)
     return Case(record, Model(di.MaxwellSlip(d.tolist(), k.tolist())), Model(di.MaxwellSlip(count)))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
+from benchmarks.motion_oracles import DahlByHand, dahl_history
 from dahl_ident.errors import DataError
 from tests.test_record_fit import DAHL, recorded
 
@@ -130,11 +131,7 @@ def test_two_days_of_waveforms_are_compared(run):
     x = 5e-3 * np.sin(2.0 * time) * (0.2 + 0.8 * np.sin(0.6 * time) ** 2)
     for day, f_max in (("monday", 0.10), ("friday", 0.12)):
         noise = 5e-4 * np.random.default_rng(int(1000 * f_max)).standard_normal(600)
-        force = np.zeros(600)
-        for i, dx in enumerate(np.diff(x), 1):  # the exact solution of Dahl's equation
-            end = f_max * np.sign(dx)
-            force[i] = end + (force[i - 1] - end) * np.exp(-30.0 / f_max * abs(dx))
-        table = np.c_[time, x, force + noise]
+        table = np.c_[time, x, dahl_history(DahlByHand(f_max, 30.0), x) + noise]
         np.savetxt(f"{day}.csv", table, delimiter=",", comments="",
                    header="time [s],displacement [m],force [N]")  # fmt: skip
         run("fit", f"{day}.csv", "--record", "--alpha", "1", "--save", f"{day}.json")

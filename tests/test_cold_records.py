@@ -9,6 +9,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.errors import DataWarning
 from tests import cold_records as cold
+from tests.histories import jenkins_force
 from tests.recovery import assert_near
 
 
@@ -97,9 +98,7 @@ class StiffnessFirst(di.Friction):
 def test_a_law_of_a_user_at_any_scale_with_its_stiffness_first(scale):
     t = np.arange(600) / 100.0
     x = 3e-3 * scale * (np.sin(6.0 * t) + np.sin(21.3 * t))
-    force = np.zeros(t.size)
-    for i, step in enumerate(np.diff(x)):  # a spring that slips
-        force[i + 1] = np.clip(force[i] + 30.0 / scale * step, -0.1, 0.1)
+    force = jenkins_force(x, np.array([30.0 / scale]), np.array([0.1 * scale / 30.0]))
     force += 1e-3 * np.random.default_rng(3).standard_normal(t.size)
     fit = di.fit(di.Record(t, displacement=x, force=force), StiffnessFirst())
     assert fit.trusted, fit.verdict

@@ -12,6 +12,7 @@ from dahl_ident import compare_models, fit
 from dahl_ident.diagnostics.held_out import predictive_density
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, relative_noise, stated, table
+from tests.histories import integrated_force
 
 
 @pytest.mark.parametrize(
@@ -159,16 +160,8 @@ X = 1e-3 * np.sin(3.0 * T) + 7e-3 * np.sin(0.9 * T) * np.sin(0.31 * T)
 
 
 def loop(x):
-    """Bouc-Wen's equation, dF = 30 (1 - 500 |F/30| sgn(F dx) + 200 F/30) dx, in small steps."""
-    fine = np.interp(np.linspace(0, x.size - 1, 40 * (x.size - 1) + 1), np.arange(x.size), x)
-    z = np.zeros(fine.size)
-    for i, dx in enumerate(np.diff(fine)):
-        middle = z[i]
-        for _ in range(3):  # the implicit midpoint rule
-            change = dx - 500.0 * abs(dx) * middle + 200.0 * dx * abs(middle)
-            middle = z[i] + 0.5 * change
-        z[i + 1] = z[i] + change
-    return 30.0 * z[::40]
+    """Return the force of a Bouc-Wen law along a displacement."""
+    return integrated_force(lambda F, s: 30.0 - 500.0 * s * F + 200.0 * abs(F), x, steps=4)
 
 
 def test_the_law_of_a_record_is_recognised():

@@ -315,7 +315,7 @@ def test_even_harmonics_of_a_comparison_of_the_force():
     """From a force F a stiffness k leads to s f - (s f - F) exp(-k p/f) after a path p."""
     k, f, A = 1e4, 30.0, 2.1e-3
 
-    def way(start, s):
+    def branch(start, s):
         first, then = (k, 0.5 * k) if s > 0.0 else (0.5 * k, k)
         kink = f / first * np.log((s * f - start) / (s * f - 10.0))
 
@@ -328,10 +328,10 @@ def test_even_harmonics_of_a_comparison_of_the_force():
 
     top = 15.0
     for _ in range(100):
-        bottom = float(way(top, -1.0).force(2.0 * A))
-        top = float(way(bottom, 1.0).force(2.0 * A))
+        bottom = float(branch(top, -1.0).force(2.0 * A))
+        top = float(branch(bottom, 1.0).force(2.0 * A))
     assert top > 10.0 > bottom
-    expected = loop_oracles.harmonics_of([way(top, -1.0), way(bottom, 1.0)], A, HARMONICS)
+    expected = loop_oracles.harmonics_of([branch(top, -1.0), branch(bottom, 1.0)], A, HARMONICS)
     assert abs(expected[2]) > 0.1
     found = (loop_of(Stepped(), A, [k, f], harmonics=HARMONICS).harmonics[0],
              harmonics_of(Stepped(k, f), A))  # fmt: skip

@@ -10,6 +10,7 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.ipopt import solve_ipopt
 from dahl_ident.problem import ProblemBatch, TableProblem
+from tests.test_generic_friction import jenkins
 
 
 def positive(name, unit):
@@ -49,14 +50,6 @@ class OneWay(di.Friction):
         return stiff * (1.0 - direction * force / (f_max * (1.5 + 0.5 * direction)))
 
 
-def jenkins(amplitude, stiff, delta):
-    """Return N of the elastoplastic element, in closed form."""
-    m = np.minimum(delta / amplitude, 1.0)
-    t = np.arccos(1.0 - 2.0 * m)
-    real = stiff / np.pi * (t - np.sin(t) * np.cos(t))
-    return np.asarray(real + 4j * stiff / np.pi * m * (1.0 - m))
-
-
 STIFF, DELTA = 30.0, 3e-3
 MASS, DAMPING, SPRING = 0.3, 0.24, 0.5
 TRUTH = {"stiff": STIFF, "delta": DELTA, "f_max": STIFF * DELTA}
@@ -73,14 +66,14 @@ def noisy(values, level=0.005, seed=1):
 
 def alone():
     A = np.geomspace(3e-4, 1e-1, 30)
-    return di.FrequencyResponse(np.ones(30), noisy(jenkins(A, STIFF, DELTA)), A)
+    return di.FrequencyResponse(np.ones(30), noisy(jenkins(STIFF, DELTA, A)), A)
 
 
 def plant(controlled):
     A = np.tile(np.geomspace(1e-3, 3e-2, 5), 4)
     f = np.repeat(np.geomspace(0.3, 3.0, 4), 5)
     omega = 2.0 * np.pi * f
-    Z = jenkins(A, STIFF, DELTA) + SPRING - MASS * omega**2 + 1j * DAMPING * omega
+    Z = jenkins(STIFF, DELTA, A) + SPRING - MASS * omega**2 + 1j * DAMPING * omega
     if controlled == "displacement":
         return di.FrequencyResponse(f, noisy(Z), A)
     return di.FrequencyResponse(
@@ -121,7 +114,7 @@ def test_random_problems_over_twelve_decades_are_recovered():
         stiff, delta = 10.0 ** rng.uniform(-6.0, 6.0, 2)
         n = int(rng.integers(8, 30))
         A = delta * 10.0 ** np.sort(rng.uniform(-0.3, rng.uniform(0.5, 2.0), n))
-        data = di.FrequencyResponse(np.ones(n), noisy(jenkins(A, stiff, delta), 1e-3, index), A)
+        data = di.FrequencyResponse(np.ones(n), noisy(jenkins(stiff, delta, A), 1e-3, index), A)
         law = (ByForce, BySlip)[index % 2]()
         found = solve(TableProblem(data, law))
         truth = np.array([stiff, delta if index % 2 else stiff * delta])
@@ -133,7 +126,7 @@ def test_random_problems_over_twelve_decades_are_recovered():
 @pytest.mark.parametrize("law", [ByForce, BySlip])
 def test_a_law_that_never_slips_says_which_parameter_runs_away(law):
     A = np.geomspace(1e-7, 1e-5, 20)
-    data = di.FrequencyResponse(np.ones(20), noisy(jenkins(A, STIFF, DELTA)), A)
+    data = di.FrequencyResponse(np.ones(20), noisy(jenkins(STIFF, DELTA, A)), A)
     found = solve(TableProblem(data, law(), noise="absolute"))
     assert found.status is Status.RUNS_AWAY
     lost = found.names[1]
@@ -159,7 +152,7 @@ def test_a_law_that_always_slips_determines_its_force():
 
 def test_like_elements_of_any_law_are_ordered_by_their_knees():
     A = np.geomspace(1e-4, 1e-1, 24)
-    Z = jenkins(A, 20.0, 1e-2) + jenkins(A, 30.0, 8e-4)
+    Z = jenkins(20.0, 1e-2, A) + jenkins(30.0, 8e-4, A)
     data = di.FrequencyResponse(np.ones(24), noisy(Z, 1e-3), A)
     found = solve(TableProblem(data, BySlip(name="first") + BySlip(name="second")))
     assert found.names[1::2] == ("first_delta", "second_delta")
@@ -169,7 +162,7 @@ def test_like_elements_of_any_law_are_ordered_by_their_knees():
 def test_a_batch_of_a_law_equals_its_tables_one_by_one():
     A = np.geomspace(3e-4, 1e-1, 20)
     tables = [
-        di.FrequencyResponse(np.ones(20), noisy(jenkins(A, STIFF, d), seed=i), A)
+        di.FrequencyResponse(np.ones(20), noisy(jenkins(STIFF, d, A), seed=i), A)
         for i, d in enumerate((1e-3, 3e-3, 1e-2))
     ]
     together = solve_many(ProblemBatch(tables, BySlip()))

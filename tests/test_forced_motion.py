@@ -18,6 +18,7 @@ from dahl_ident.elements import (
 )
 from dahl_ident.engine import band_limited
 from dahl_ident.errors import FitError, ModelError
+from tests import cold_records
 from tests.motions import Driven, differences, slopes
 
 RATE = 750.0
@@ -28,17 +29,9 @@ STIFFNESSES, SLIPS = [2e4, 1e4], [2e-4, 5e-4]
 F_MAX, SIGMA, GAP = 20.0, 4e4, 4e-4
 
 
-def multisine(samples, seed=0):
+def multisine(samples):
     """Return whole periods of a drive of 5 to 150 Hz, and the drive as a function of time."""
-    rng = np.random.default_rng(seed)
-    lines = np.arange(samples // 2)
-    lines = lines[(lines * RATE / samples > 5.0) & (lines * RATE / samples < 150.0)]
-    amplitudes = np.exp(2j * np.pi * rng.random(lines.size)) * 50.0 * np.sqrt(2.0 / lines.size)
-
-    def drive(t):
-        return float(np.real(amplitudes @ np.exp(2j * np.pi * lines * t * RATE / samples)))
-
-    return np.array([drive(i / RATE) for i in range(samples)]), drive
+    return cold_records.multisine(samples, RATE, 5.0, 150.0, 50.0, seed=0)
 
 
 def test_a_moving_base_is_a_force_of_minus_mass_times_acceleration():

@@ -12,20 +12,12 @@ from dahl_ident import fit
 from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from tests.derivatives import central_differences
+from tests.histories import jenkins_force
 from tests.recovery import assert_near
 from tests.test_generic_friction import Jenkins
 
 SLIPS, STIFF = np.array([0.1, 0.3, 1.0]), np.array([3.0, 2.0, 1.0])
 LAW = di.MaxwellSlip(SLIPS, STIFF)
-
-
-def sliders(x, start):
-    """Return the force of the three elements, each clipped at its limit, step by step."""
-    f, total = start, [float(start.sum())]
-    for step in np.diff(x):
-        f = np.clip(f + STIFF * step, -STIFF * SLIPS, STIFF * SLIPS)
-        total.append(float(f.sum()))
-    return np.array(total)
 
 
 def test_derivatives_are_exact_and_one_sided_at_a_kink():
@@ -58,7 +50,8 @@ def test_the_force_over_time_is_that_of_the_sliders():
             x = np.round(x, 1)  # loops that close exactly, and pauses
         u = float(rng.choice([0.0, 0.2, -0.7]))
         start = np.clip(STIFF * u, -STIFF * SLIPS, STIFF * SLIPS)
-        np.testing.assert_allclose(LAW.force(x, float(start.sum())), sliders(x, start), atol=1e-11)
+        expected = jenkins_force(x, STIFF, SLIPS, start)
+        np.testing.assert_allclose(LAW.force(x, float(start.sum())), expected, atol=1e-11)
 
 
 def test_facts_and_refusals():

@@ -146,3 +146,12 @@ def test_the_report_says_whether_ranks_stay_inside(tmp_path):
     text = report(results, tmp_path)
     assert "| friction | 100 | 0 | f_max |" in text
     assert "NO" not in text
+
+
+def test_nuts_gives_the_same_posterior():
+    """An independent sampler; ``make nuts`` is the long version."""
+    pytest.importorskip("numpyro", reason="the extra nuts is not installed")
+    from benchmarks.nuts import compare
+
+    for what, ours, theirs, apart in compare(draws=1000, ess=2000.0):
+        assert abs(apart) < 4.0, (what, ours, theirs)
