@@ -365,6 +365,13 @@ def test_command_line(tmp_path, run):
     done = run("campaign", str(path), "--jobs", "1", "--report", str(report), "--json")
     assert json.loads(done.out)["to_do"] == ["d000", "d001", "d002", "d003"]
     assert b"Population: f_max" in report.read_bytes()
+    shown = re.findall(r">([^<>]+)<", report.read_text())
+    table = pd.read_csv(tmp_path / "results" / "results.csv").iloc[0]
+    at = len(shown) - 1 - shown[::-1].index("d000")
+    value, u = shown[at + 2 : at + 4]  # f_max; u has two digits, and the value as many decimals
+    assert float(u) == pytest.approx(table["u_f_max"], rel=0.06)
+    assert len(value.partition(".")[2]) == len(u.partition(".")[2])
+    assert float(value) == pytest.approx(table["f_max"], abs=table["u_f_max"])
     assert run("campaign", str(path), "--report", "campaign.pdf").status == 0
     assert Path("campaign.pdf").read_bytes().startswith(b"%PDF")
     as_waves = path.read_text().replace("response", "record") + '[output]\nfolder = "waves"\n'

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dahl_ident.campaigns.population import USABLE, Population, PopulationParameter
+from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.reporting.document import (
     Block,
     Bullets,
@@ -118,7 +119,12 @@ def _all_fits(table: pd.DataFrame, folder: str) -> Iterator[Block]:
         if "report" in table and isinstance(row["report"], str):
             cells[0] = Cell(cells[0].text, link=f"{folder}/{row['report']}")
         for name in names:
-            cells += [_cell(row[name], 5), _cell(row[f"u_{name}"], 2)]
+            value, u = float(row[name]), float(row[f"u_{name}"])
+            texts = rounded(value, u)
+            cells += [
+                Cell(text, x) if np.isfinite(x) else Cell("-")
+                for text, x in zip(texts, (value, u), strict=True)
+            ]
         rows.append(tuple(cells))
     units = {
         c: f" [{table[f'unit_{c}'].dropna().iloc[0]}]" if f"unit_{c}" in table else ""
@@ -130,7 +136,3 @@ def _all_fits(table: pd.DataFrame, folder: str) -> Iterator[Block]:
     )
     if len(table) > _LISTED:
         yield Paragraph(f"{len(table) - _LISTED} more fits are in the table of results.")
-
-
-def _cell(value: float, digits: int) -> Cell:
-    return number(value, digits) if np.isfinite(value) else Cell("-")
