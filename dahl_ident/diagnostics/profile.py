@@ -217,9 +217,10 @@ class Profiler:
         for edge in self._edges:
             starts.append(np.where(held, starts[0], edge))
             rows.append(rows[0])
-        for edge in self._edges:
-            starts.append(np.where(held, starts[0], edge))
-            rows.append(rows[0])
+        for chart in self._microslip_charts:
+            valley, applies = _along_valley(chart, index, theta, change, self._smallest)
+            starts.append(valley[applies])
+            rows.append(np.flatnonzero(applies))
         row = np.concatenate(rows)
         return self._constrained(index[row], np.concatenate(starts)).lowest(row)
 
