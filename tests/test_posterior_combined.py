@@ -146,6 +146,16 @@ def test_a_parameter_that_a_default_prior_sets_is_not_determined():
     assert known.status.usable
 
 
+@pytest.mark.parametrize(("noise", "status"), [(0.01, "not determined"), (0.001, "trusted")])
+def test_a_parameter_with_a_wide_interval_is_not_determined(noise, status):
+    microslip = friction_table(12, 0.01, 0.1, noise)
+    grid = di.posterior(microslip, LINEAR, method="grid", tolerance=1e-2)
+    low, high = grid.quantile("f_max", Q)
+    assert low < 0.1 < high
+    assert str(grid.status) == status, grid.verdict
+    assert (high > 50.0 * low) == (status != "trusted")
+
+
 def test_refusals():
     with pytest.raises(
         ValidationError, match="uncertainty is 'all'; expected one of combined, noise"

@@ -32,6 +32,7 @@ from dahl_ident.diagnostics.judgement import (
     described,
     determined,
 )
+from dahl_ident.diagnostics.verdicts import IDENTIFIED_BELOW, NOT_IDENTIFIED_ABOVE
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
 from dahl_ident.results.fit_result import FitResult
@@ -390,7 +391,8 @@ class Posterior(Result):
     def judgement(self) -> Judgement:
         """Every finding about the posterior, and the status that follows from them.
 
-        Not determined if it has not converged, or a default prior sets a parameter; not described
+        Not determined if it has not converged, or a default prior sets a parameter, or one is known
+        to no better than a factor of seven either way; not described
         if data and model or prior contradict each other; approximate if the fit is.
         """
         return Judgement([*self._objections(), *self._notes(), *reading(self)])
@@ -401,6 +403,8 @@ class Posterior(Result):
         severity = VerdictStatus.TRUSTED if converged else VerdictStatus.NOT_DETERMINED
         code = "sampled" if converged else "not_converged"
         yield determined(code, severity, message=self.message)
+        if self.likelihood != "none":
+            yield from self._wide()
         lost = VerdictStatus.NOT_DESCRIBED if converged else VerdictStatus.NOT_DETERMINED
         for influence in self.prior_influences:
             by_default = influence.name in self.default_priors
@@ -410,6 +414,24 @@ class Posterior(Result):
             yield replace(finding, severity=lost)
         if fit is not None and fit.status is not VerdictStatus.NOT_DESCRIBED:
             yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
+
+    def _wide(self) -> Iterator[Finding]:
+        """Yield the positive parameters with wide intervals, except those that priors set."""
+        free = (self.fit or self).problem.names
+        by_prior = {influence.name for influence in self.prior_influences}
+        u = {
+            name: float(np.diff(np.log(self.quantile(name, _LEVELS[[0, -1]])))[0]) / 4.0
+            for name, positive in zip(self.names, self._density.logarithmic, strict=True)
+            if positive and name in free and name not in by_prior
+        }
+        lost = tuple(name for name in u if u[name] > NOT_IDENTIFIED_ABOVE)
+        weak = tuple(name for name in u if IDENTIFIED_BELOW < u[name] <= NOT_IDENTIFIED_ABOVE)
+        known = tuple(name for name in u if name not in lost + weak)
+        if lost:
+            yield determined("undetermined", determined=known, weak=weak, lost=lost)
+        elif weak:
+            is_weak = {"identified": known, "weak": weak, "by_prior": ()}
+            yield determined("identified", VerdictStatus.TRUSTED, **is_weak)
 
     def _notes(self) -> Iterator[Finding]:
         """Yield counted sources of error, assumptions, and the evidence."""
