@@ -157,22 +157,20 @@ def test_a_parameter_with_a_wide_interval_is_not_determined(noise, status):
 
 
 def test_refusals():
-    with pytest.raises(
-        ValidationError, match="uncertainty is 'all'; expected one of combined, noise"
-    ):
-        di.posterior(friction_table(), LINEAR, method="grid", uncertainty="all")
-    tied = di.fit(
-        friction_table(),
-        LINEAR,
-        method="ipopt",
-        constraints=lambda p: [p["sigma"] == 300 * p["f_max"]],
-    )
+    table = friction_table()
+    with pytest.raises(ValidationError, match="uncertainty is 'all'; expected one of combined, no"):
+        di.posterior(table, LINEAR, method="grid", uncertainty="all")
+
+    def tie(p):
+        return [p["sigma"] == 300 * p["f_max"]]
+
+    tied = di.fit(table, LINEAR, method="ipopt", constraints=tie)
     with pytest.raises(ValidationError, match="had constraints, which a posterior"):
         di.posterior(tied, method="grid")
 
 
-def test_what_rows_share_may_be_all_there_is():
-    """Residuals along one smooth curve leave no noise of their own."""
+def test_errors_that_rows_share_may_be_the_only_ones():
+    """Residuals along one smooth curve leave no noise."""
     A = np.geomspace(0.1, 10.0, 12) * 0.1 / 30.0
     plant = di.Dahl(0.1, 30.0) + di.Spring(0.3)
     data = di.FrequencyResponse(np.ones(12), plant.dynamic_stiffness(A, 2.0 * np.pi), A)

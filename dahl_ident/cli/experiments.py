@@ -89,12 +89,6 @@ class Bench:
         }
         return limits | stated(self, "time")
 
-    def motion_keywords(self, sample_rate: float | None) -> dict[str, Any]:
-        """Return the arguments of ``plan`` for motions in time, or for settled sines."""
-        if self.motion is None:
-            return {"steady": self.steady}
-        return {"candidates": self.motion, "sample_rate": sample_rate}
-
 
 @dataclass(frozen=True)
 class Aim:
@@ -171,6 +165,9 @@ def plan(
         raise ValidationError("--waveform and --motion need --sample-rate, Hz; give it")
     if sample_rate is not None and waveform is None and bench.motion is None:
         raise ValidationError("--sample-rate needs --waveform or --motion; give one of them")
+    kind: dict[str, Any] = {"steady": bench.steady}
+    if bench.motion is not None:
+        kind = {"candidates": bench.motion, "sample_rate": sample_rate}
     result = make_plan(
         _fit_or_model(fit, model),
         limits=bench.limits(),
@@ -181,7 +178,7 @@ def plan(
         change_over=bench.change_over,
         between_runs=bench.between_runs,
         seed=seed,
-        **bench.motion_keywords(sample_rate),
+        **kind,
         **aim.keywords(),
     )
     if table is not None:

@@ -144,7 +144,10 @@ def directions(element: Element) -> Directions:
         for label, p in parameters.items()
         if label in element.scale_parameters and p not in linear
     )
-    reference = _reference(scale)
+    # the divisor of the other scale parameters: a known one, or a stiffness
+    known = [p for p in scale if not p.free]
+    stiff = [p for p in scale if p.dimension == STIFFNESS]
+    reference = next(iter((*known, *stiff, *scale)), None)
     searched = []
     for parameter in element.parameters:
         if not parameter.free or parameter in linear or parameter is reference:
@@ -160,13 +163,6 @@ def directions(element: Element) -> Directions:
 def is_positive(parameter: Parameter) -> bool:
     """Return whether a parameter takes values above zero only."""
     return parameter.positive or parameter.lower >= 0.0
-
-
-def _reference(scale: tuple[Parameter, ...]) -> Parameter | None:
-    """Return the divisor of the other scale parameters: a known one, or a stiffness."""
-    known = [p for p in scale if not p.free]
-    stiff = [p for p in scale if p.dimension == STIFFNESS]
-    return next(iter((*known, *stiff, *scale)), None)
 
 
 def free_springs(problem: TableProblem) -> list[Parameter]:

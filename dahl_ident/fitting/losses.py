@@ -120,18 +120,6 @@ class Loss:
         return float(np.mean(self.slope(z) + 2.0 / self.parts * self.curvature(z) * z))
 
 
-def _huber(z: FloatArray) -> FloatArray:
-    return np.where(z <= KNEE**2, z, 2.0 * KNEE * np.sqrt(z) - KNEE**2)
-
-
-def _huber_slope(z: FloatArray) -> FloatArray:
-    return np.where(z <= KNEE**2, 1.0, KNEE / np.sqrt(np.maximum(z, KNEE**2)))
-
-
-def _huber_curvature(z: FloatArray) -> FloatArray:
-    return np.where(z <= KNEE**2, 0.0, -0.5 * KNEE * np.maximum(z, KNEE**2) ** -1.5)
-
-
 def _student_t(parts: int) -> Loss:
     power = TAIL_DOF + parts
     return Loss(
@@ -144,7 +132,13 @@ def _student_t(parts: int) -> Loss:
 
 
 LOSSES = {
-    "huber": Loss("huber", _huber, _huber_slope, _huber_curvature, power=2),
+    "huber": Loss(
+        "huber",
+        lambda z: np.where(z <= KNEE**2, z, 2.0 * KNEE * np.sqrt(z) - KNEE**2),
+        lambda z: KNEE / np.sqrt(np.maximum(z, KNEE**2)),
+        lambda z: np.where(z <= KNEE**2, 0.0, -0.5 * KNEE * np.maximum(z, KNEE**2) ** -1.5),
+        power=2,
+    ),
     "soft_l1": Loss(
         "soft_l1",
         lambda z: 2.0 * z / (np.sqrt(1.0 + z) + 1.0),

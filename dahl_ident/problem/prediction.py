@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.control_interop.force_balance import solve
 from dahl_ident.data.rows import Rows
-from dahl_ident.elements import Model, Parameter
+from dahl_ident.elements import Model
 from dahl_ident.elements.driven_motion import Shooting
 from dahl_ident.elements.facts import Sine, StiffnessGradient
 from dahl_ident.errors import DataError, argument
@@ -161,7 +161,10 @@ class Predictor:
         self._orbits = {} if orbits is None else orbits
         self._exact_sensors = sensors.are_exact
         names = space.names
-        self._slots = [_slot(p, names) for p in (*model.parameters, *sensors.parameters)]
+        self._slots = [  # the source of each value: an index into theta, or a constant
+            (names.index(p.name), np.empty(0)) if p.free else (None, np.asarray(p.value))
+            for p in (*model.parameters, *sensors.parameters)
+        ]
         self.rows = rows
         _check(rows, self._model)
         power, self._exponent = DEFINITIONS[rows.quantity]
@@ -384,13 +387,6 @@ class Predictor:
         )
         slots = self._slots[-3:]
         return [d for d, (index, _) in zip(by_sensor, slots, strict=True) if index is not None]
-
-
-def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, FloatArray]:
-    """Return the source of a parameter's value: an index into theta, or a constant."""
-    if parameter.free:
-        return names.index(parameter.name), np.empty(0)
-    return None, np.asarray(parameter.value)
 
 
 def _check(rows: Rows, model: Model) -> None:

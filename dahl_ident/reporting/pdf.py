@@ -106,7 +106,10 @@ def _page(document: Document) -> FPDF:
         """A page that shows codes for characters that its font lacks, which fpdf2 would omit."""
 
         def normalize_text(self, text: str) -> str:
-            return super().normalize_text(_printable(text))
+            known = _known_characters()
+            return super().normalize_text(
+                "".join(c if ord(c) in known or c.isspace() else f"<U+{ord(c):04X}>" for c in text)
+            )
 
         def footer(self) -> None:
             self.set_y(-12)
@@ -349,9 +352,3 @@ def _known_characters() -> frozenset[int]:
     from matplotlib.ft2font import FT2Font
 
     return frozenset(FT2Font(str(_FONTS / _FACES[""])).get_charmap())
-
-
-def _printable(text: str) -> str:
-    """Return text with codes for characters that the font lacks."""
-    known = _known_characters()
-    return "".join(c if ord(c) in known or c.isspace() else f"<U+{ord(c):04X}>" for c in text)
