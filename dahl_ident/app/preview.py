@@ -87,8 +87,8 @@ def _add_data(
     files: Sequence[str], columns: dict[str, Any], reading: dict[str, str], result: dict[str, Any]
 ) -> None:
     """Read the files as the commands do, and add a summary and pictures."""
-    common: dict[str, Any] = {n: reading[n] for n in COMMON_OPTIONS if reading.get(n)}
-    common["columns"] = columns
+    common: dict[str, Any] = {"columns": columns}
+    common |= {n: reading[n] for n in COMMON_OPTIONS if reading.get(n)}
     kind = reading.get("kind", "")
     if kind in ("", "table"):
         options: dict[str, Any] = {n: reading[n] for n in TABLE_OPTIONS if reading.get(n)}

@@ -296,15 +296,6 @@ class ErrorModel(ErrorContributions):
             total += float(self.state.variances[0]) * self.noise_square
         return float(np.sqrt(total))
 
-    @property
-    def between_runs(self) -> FloatArray:
-        """Variance of each theta between runs."""
-        variances = np.zeros(len(self.names))
-        for source, variance in zip(self.sources, self.variances.tolist(), strict=True):
-            if source.name == RUNS and source.per_test in self.names:
-                variances[self.names.index(source.per_test)] += variance
-        return variances
-
     @cached_property
     def noise_square(self) -> float:
         """Mean square of ln gain and phase of the fundamentals, by residuals of unit variance."""

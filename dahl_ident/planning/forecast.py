@@ -99,11 +99,6 @@ class Forecast:
             between=between,
         )
 
-    @property
-    def runs_differ(self) -> bool:
-        """Whether there is scatter between runs."""
-        return self.scatter > 0.0 or self.between is not None
-
     def thinned(self) -> Forecast:
         """Return the forecast at the few draws that a search averages over."""
         most = SEARCHED if self.departures == 0 else _SEARCHED_WITH_DEPARTURES
@@ -150,7 +145,7 @@ class Forecast:
         """
         after = self.uncertainty(self.covariance(design))
         shares = dict.fromkeys(after, 0.0)
-        if self.runs_differ:
+        if self.scatter > 0.0 or self.between is not None:
             alike = replace(self, scatter=0.0, between=None)
             by_noise = self.uncertainty(alike.covariance(design))
             for name, u in by_noise.items():

@@ -184,7 +184,9 @@ def _of_table(
         information = np.linalg.inv(errors.covariance)[part]
         stated, cycles = _row_noise(wider, 0.0)
         noise = float(np.hypot(stated, errors.rms(NOISE)))
-        differing = errors.between_runs[kept]
+        pairs = list(zip(errors.sources, errors.variances.tolist(), strict=True))
+        of_runs = {s.per_test: variance for s, variance in pairs if s.name == RUNS}
+        differing = np.array([of_runs.get(p.name, 0.0) for p in parameters])
         between = differing if differing.any() else None
     else:
         wider = problem.like(model=model) if assumed else problem

@@ -35,8 +35,7 @@ _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
 _NEARLY_ALL = 0.99  # fraction of the longest time that counts as all of it, as cycles are whole
-_HELPS = 1.25  # factor by which a wider limit reduces an uncertainty that it prevents
-_HOURS = 7200.0  # s, from which a duration is stated in hours as well
+_HOURS = 7200.0  # s, from which the time is stated in hours as well
 _WIDER = 10.0  # factor by which a limit is widened to find its effect
 _COSTLY = _WIDER**0.75  # effect above that of the frequency or the time, its square root
 _MODEL_ERROR = {
@@ -317,12 +316,13 @@ class Plan:
             )
             for name, e in self.expected.items()
         ]
+        hours = f" ({self.seconds / 3600.0:.2g} h)" * (self.seconds >= _HOURS)
         legend = "Relative standard uncertainties"
         if any(map(is_expanded, self.expected)):
             legend += "; U(...) expanded, 95.45 %"
         return "\n".join(
             [
-                f"{head} in {_duration(self.seconds)}{end if self.target else ''}.",
+                f"{head} in {self.seconds:.4g} s{hours}{end if self.target else ''}.",
                 "",
                 self._table(),
                 "",
@@ -349,7 +349,7 @@ class Plan:
             return []
         with_all = self.search.expected_after(time)
         gain = ", ".join(f"{name} {percent(with_all[name].after, 3)}" for name in self.target)
-        lines = [f"{_duration(time - self.seconds)} are left; the whole time would give {gain}."]
+        lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {gain}."]
         if self.runs == 1:
             lines.append(
                 f"Repeat the plan in {min(5, int(time // self.seconds))} runs, each a new "
@@ -375,10 +375,6 @@ class Plan:
             for i, row in enumerate(rows, start=1)
         ]
         return table([["", *headings], *lines])
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.4g} s" + f" ({seconds / 3600.0:.2g} h)" * (seconds >= _HOURS)
 
 
 def _cell(value: Any) -> str:
@@ -463,7 +459,7 @@ def _prevented_by(search: Search, name: str) -> str:
     limit, gain = _widened(search, name)
     if not limit:
         return "no limit was stated that prevents it"
-    if not gain > _HELPS:
+    if not gain > 1.25:
         if search.forecast.model_error == "estimated":
             return "no limit alone prevents it: use a model that describes the data better"
         return "no limit alone prevents it: reduce the noise, or fix a parameter"

@@ -79,7 +79,7 @@ class Search:
 
     def _solve(self, time: float, weight: float, start: Sequence[int]) -> Design | None:
         q, best = self.question, None
-        most = _MOST_RUNS if self.forecast.runs_differ else 1
+        most = _MOST_RUNS if q.scatter > 0.0 or self.forecast.between is not None else 1
         for runs in (q.runs,) if q.runs else range(1, most + 1):
             objective = self._objective(weight, runs)
             search = Exchange(objective, self.bench, self._promising(time), self._coverage)
