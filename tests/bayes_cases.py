@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 import dahl_ident as di
-from tests.friction_tables import FRICTION, X_C, table
+from tests.friction_tables import FRICTION, X_C, stated, table
 
 
 def friction_table(
@@ -24,11 +26,7 @@ def spring_table(
 
 def with_covariance(table: di.FrequencyResponse, noise: float) -> di.FrequencyResponse:
     """Return the table with a covariance: real and imaginary part have a relative error `noise`."""
-    variance = (noise * np.abs(table.response)) ** 2
-    covariance = variance[:, None, None] * np.eye(2)
-    return di.FrequencyResponse(
-        table.frequency_hz, table.response, table.amplitude, covariance=covariance
-    )
+    return replace(table, covariance=stated(table.response, noise))
 
 
 def harmonic_table(amplitude_error: float) -> di.FrequencyResponse:
@@ -44,6 +42,6 @@ def harmonic_table(amplitude_error: float) -> di.FrequencyResponse:
         exact + error,
         measured,
         harmonic=harmonic,
-        covariance=(0.02 * np.abs(exact))[:, None, None] ** 2 * np.eye(2),
+        covariance=stated(exact, 0.02),
         amplitude_std=amplitude_error * amplitude if amplitude_error else None,
     )

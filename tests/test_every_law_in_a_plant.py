@@ -15,6 +15,7 @@ import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Parameter
 from tests.cold_records import iwan_elements
+from tests.friction_tables import driven, relative_noise
 from tests.recovery import assert_near
 from tests.test_generic_friction import Jenkins, SlopeOfDahl
 
@@ -224,14 +225,8 @@ def table(case, levels, frequencies):
     u, f = (
         g.ravel() for g in np.meshgrid(drives, np.geomspace(0.4, 2.6, frequencies), indexing="ij")
     )
-    R = settled(case.simulated, f, u) / u
-    s = NOISE * np.abs(R)
-    rng = np.random.default_rng(7)
-    return di.FrequencyResponse(
-        f, R + s * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)), drive=u,
-        level=u, covariance=s[:, None, None] ** 2 * np.eye(2), controlled="force",
-        quantity="receptance",
-    )  # fmt: skip
+    R = settled(case.simulated, f, u) / u * relative_noise(f.size, NOISE, 7)
+    return driven(f, R, u, NOISE, level=u)
 
 
 VARIANTS = ("user's law", "linear system", "Dahl, free exponent")  # of other cases
