@@ -135,8 +135,8 @@ def finish(result: Result) -> None:
 Predicted = Annotated[
     str | None,
     option(
-        "For records: whether force or motion is predicted from the other; by default motion if "
-        "the model has a mass.",
+        "For records: force (from the motion) or motion (from the force); by default motion if "
+        "the model has a mass, else force.",
         one_of="force|motion",
     ),
 ]

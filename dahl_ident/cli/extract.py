@@ -46,8 +46,8 @@ class Extracting:
     num_periods: int | None = setting("Last periods of each segment to use.")
     settling_periods: int | None = setting("Leading periods of each segment to omit.")
     harmonics: str | None = setting(
-        "Harmonics to extract, 0 to 9: by default the odd ones, and the even ones of an "
-        "asymmetric force; if force is controlled, only 1, and others are of the displacement."
+        "Harmonics of the force, 0 to 9; by default the odd ones, and the even ones of an "
+        "asymmetric force. With force controlled: those of the displacement, by default 1."
     )
     controlled: str = controlled_setting()
     min_share: float = setting("Minimum share of the sine in the power.", 0.6)
