@@ -19,14 +19,12 @@ PLANT = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
 INSIDE = 0.9973
 
 
-def table(name):
-    return di.load_dataset(name)
+table: Any = di.load_dataset
 
 
-def points(name, **options):
+def points(name):
     """Return the fundamentals that the extraction finds in a shipped recording."""
-    record: Any = di.load_dataset(name)
-    return extract(record, **options).select(harmonic=1)  # passed on
+    return extract(table(name)).select(harmonic=1)
 
 
 def truth(name):
@@ -66,22 +64,21 @@ def test_clean():
         assert fit.params[name].value == pytest.approx(value, rel=1e-9)
 
 
-def test_microslip_says_that_f_max_is_only_bounded_below():
-    fit = di.fit(table("microslip"), di.Dahl())
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("microslip", ("Only sigma is determined; not f_max.",
+                       "no amplitude up to 6.7e-06 m reaches slip: drive above that")),
+        ("gross_slip", ("Only f_max is determined; not sigma",)),
+    ],
+)  # fmt: skip
+def test_what_is_only_bounded_below_is_said(name, words):
+    fit = di.fit(table(name), di.Dahl())
     assert not fit.trusted
     assert fit.verdict.startswith("Not determined.")
-    assert "Only sigma is determined; not f_max." in fit.verdict
-    assert "no amplitude up to 6.7e-06 m reaches slip: drive above that" in fit.verdict
-    assert_recovered(fit, truth("microslip"), "f_max", "sigma")
-    assert_posterior_holds(fit, truth("microslip"), "f_max", "sigma")
-
-
-def test_gross_slip_says_that_sigma_is_only_bounded_below():
-    fit = di.fit(table("gross_slip"), di.Dahl())
-    assert not fit.trusted
-    assert "Only f_max is determined; not sigma" in fit.verdict
-    assert_recovered(fit, truth("gross_slip"), "f_max", "sigma")
-    assert_posterior_holds(fit, truth("gross_slip"), "f_max", "sigma")
+    assert [text for text in words if text not in fit.verdict] == []
+    assert_recovered(fit, truth(name), "f_max", "sigma")
+    assert_posterior_holds(fit, truth(name), "f_max", "sigma")
 
 
 def test_an_exponent_of_2_is_not_taken_for_linear_dahl():
@@ -145,9 +142,11 @@ def test_a_delayed_and_mis_scaled_sensor_is_caught():
 
 
 def test_friction_alone_that_a_drive_moves_without_bound_is_refused_with_what_to_add():
+    data = table("fig_7_plant")
+    few = data.select(rows=np.arange(data.n) % 4 == 0)
     for throw in (False, True):
-        with pytest.raises(FitError, match=r"predict 0\.05 Hz, 1 mN.*add the mass, damper"):
-            di.fit(table("fig_7_plant"), di.Dahl(), throw=throw)
+        with pytest.raises(FitError, match=r"predict 0\.05 Hz, 150 mN.*add the mass, damper"):
+            di.fit(few, di.Dahl(), throw=throw)
 
 
 def test_degrees_of_freedom_without_bound_are_stated_alike_in_budget_and_intervals():
@@ -169,15 +168,11 @@ def test_combinations_that_are_determined_have_the_uncertainty_of_their_budget()
     A = np.geomspace(1e-6, 1e-5, 12)
     exact = di.Dahl(0.1, 30.0).describing_function(A) + 100.0
     rng = np.random.default_rng(5)
-    days = [
-        FrequencyResponse(
-            np.ones(12),
-            exact * (1.0 + 0.05 * scatter) * np.exp(1e-4 * rng.standard_normal((12, 2)) @ [1, 1j]),
-            A,
-            run=[f"day {scatter:+d}"] * 12,
-        )
-        for scatter in (-1, 0, 1)
-    ]
+    days = []
+    for scatter in (-1, 0, 1):
+        noise = np.exp(1e-4 * rng.standard_normal((12, 2)) @ [1, 1j])
+        N = exact * (1.0 + 0.05 * scatter) * noise
+        days.append(FrequencyResponse(np.ones(12), N, A, run=[f"day {scatter:+d}"] * 12))
     fit = di.fit(FrequencyResponse.concatenate(days), di.Dahl() + di.Spring(), throw=False)
     (combination, *_) = (c for c in fit.identifiability.combinations if "+" in c.name)
     stated = fit.budget()[combination.name]

@@ -217,7 +217,9 @@ class TestBootstrap:
         assert (np.abs(bootstrap.upper[1] - profile.upper[1]) < 0.05 * width).all()
 
     def test_works_for_driven_plants(self):
-        result = fit(plant_table(), Dahl() + Spring(), fixed=None, throw=False)
+        data = plant_table()
+        data = data.select(rows=np.arange(data.n) % 3 == 0)
+        result = fit(data, Dahl() + Spring(), fixed=None, throw=False)
         found = result.conf_interval("bootstrap", replicates=99)
         assert set(found) == {"f_max", "sigma", "stiffness"}
 
@@ -230,7 +232,7 @@ class TestBootstrap:
 
     def test_is_open_where_replicates_run_away(self):
         result = fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
-        found = result.conf_interval("bootstrap", replicates=499)
+        found = result.conf_interval("bootstrap", replicates=199)
         assert found["f_max"][0].upper == np.inf
         assert found["sigma"][0].upper < np.inf
 
@@ -245,7 +247,7 @@ class TestBootstrap:
         C = stated(data.response, 0.01)
         for dof in (np.inf, 5.0):
             result = fit(replace(data, covariance=C, dof=np.full(30, dof)), Dahl())
-            _, low, high = result.conf_interval("bootstrap", replicates=999)["f_max"][1]
+            _, low, high = result.conf_interval("bootstrap", replicates=499)["f_max"][1]
             widths.append(high - low)
         assert 1.0 < widths[1] / widths[0] < 2.0
 

@@ -168,7 +168,7 @@ def test_negative_damping_against_the_closed_form():
     assert [c.stable for c in cycles] == [True, False]
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(
     proportional=st.floats(1.0, 1e3),
     derivative=st.floats(0.1, 30.0),

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,6 +141,11 @@ def test_error_bars_cover(pole):
     assert binom.ppf(1e-4, runs, 0.95) <= inside, inside
 
 
+def sources(fit, name):
+    """Return the contributions to the uncertainty of a parameter by their sources."""
+    return {row.source: row.u for row in fit.budget()[name].rows}
+
+
 @pytest.mark.parametrize("noise", [1e-5, pytest.param(1e-6, marks=pytest.mark.long)])
 def test_noise_of_the_displacement_does_not_count_as_travel(noise):
     # an encoder's noise at rest moves the model's friction by 7 standard uncertainties and more
@@ -159,8 +165,7 @@ def test_noise_of_the_displacement_does_not_count_as_travel(noise):
         inside += low < 0.1 < high
     assert binom.ppf(1e-4, runs, 0.95) <= inside, inside
     assert "not counted as travel" in fit.verdict
-    sources = {row.source for row in fit.budget()["f_max"].rows}
-    assert {"exponent", "noise", "noise in the displacement"} <= sources
+    assert {"exponent", "noise", "noise in the displacement"} <= sources(fit, "f_max").keys()
     again = FitResult.from_json(fit.to_json())
     assert again.verdict == fit.verdict
     still = di.Record(t, displacement=x, force=force)
@@ -220,7 +225,7 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness():
     assert_near(fit, truth, 4.0)
     assert fit.params["stiffness"].stderr < 0.6
     assert fit.budget()["mass"].rows[0].source == "noise"
-    assert {"noise", "noise in the drive"} <= {r.source for r in fit.budget()["mass"].rows}
+    assert {"noise", "noise in the drive"} <= sources(fit, "mass").keys()
 
 
 def test_noise_in_the_displacement_counts_by_its_mean_square():
@@ -235,8 +240,7 @@ def test_noise_in_the_displacement_counts_by_its_mean_square():
         record = di.Record(t, displacement=measured, force=force)
         start = {"f_max": 0.1, "sigma": 30.0, "stiffness": 5.0}
         fit = di.fit(record, di.Dahl() + di.Spring(), start=start)
-        rows = {row.source: row.u for row in fit.budget()["sigma"].rows}
-        found.append(rows["noise in the displacement"])
+        found.append(sources(fit, "sigma")["noise in the displacement"])
     assert max(found) / min(found) < 3.0
 
 
@@ -250,7 +254,7 @@ def turning_row(step, seed):
     record = di.Record(t, displacement=x + step * wrong, force=force)
     start = {"f_max": 0.1, "sigma": 30.0, "stiffness": 5.0}
     fit = di.fit(record, di.Dahl(alpha=1.0) + di.Spring(), start=start)
-    rows = {row.source: row.u for row in fit.budget()["sigma"].rows}
+    rows = sources(fit, "sigma")
     return rows.get("displacement at turning points", 0.0) / rows["noise"]
 
 
@@ -315,7 +319,7 @@ def test_what_the_model_misses_from_place_to_place_is_in_the_budget():
     assert fit.status.value == "approximate"
     assert fit.errors.least_dof == 19.0  # of Student's t in the bands
     steady = di.fit(recorded(DAHL, "random", samples, 1e-3), di.Dahl())
-    assert "model error" not in {row.source for row in steady.budget()["f_max"].rows}
+    assert "model error" not in sources(steady, "f_max")
     assert steady.trusted
 
 
@@ -395,9 +399,7 @@ def test_a_reversed_force_is_named_as_the_cause(channel):
 def test_stored_and_read_again(tmp_path):
     fit = di.fit(recorded(BOUC_WEN, "random", 500, 1e-3), di.BoucWen())
     again = FitResult.load(fit.save(tmp_path / "fit.json"))
-    assert {n: str(p) for n, p in again.params.items()} == {
-        n: str(p) for n, p in fit.params.items()
-    }
+    assert list(map(str, again.params.items())) == list(map(str, fit.params.items()))
     assert again.verdict == fit.verdict
     with pytest.raises(DataError, match="a saved fit"):
         FitResult.from_json("{}")
@@ -431,22 +433,27 @@ def test_prediction_of_another_record():
 
 
 def test_refusals():
-    record = recorded(DAHL, "random", 100, 1e-3)
-    t = np.arange(100.0)
-    with pytest.raises(DataError, match="no displacement"):
-        di.fit(di.Record(t, velocity=np.sin(t), force=t), di.Dahl())
-    with pytest.raises(DataError, match="expected at least 16"):
-        di.fit(recorded(DAHL, "random", 12, 0.0), di.Dahl())
-    with pytest.raises(DataError, match="no record"):
-        di.fit([], di.Dahl())
-    with pytest.raises(ModelError, match="nothing is free"):
-        di.fit(record, DAHL)
-    with pytest.raises(ModelError, match="start names nothing"):
-        di.fit(record, di.Dahl(), start={"nothing": 1.0})
-    with pytest.raises(ValidationError, match="noise is given with records: their noise"):
-        di.fit(record, di.Dahl(), noise="relative")
-    with pytest.raises(ValidationError, match="data holds a str"):
-        di.fit("run.csv", di.Dahl())  # type: ignore[arg-type]
+    record: Any = recorded(DAHL, "random", 100, 1e-3)
+    t, name = np.arange(100.0), "run.csv"
+    of_velocity = di.Record(t, velocity=np.sin(t), force=t)
+    cases: list[tuple[type[Exception], str, Any, di.Dahl, dict[str, Any]]] = [
+        (DataError, "no displacement", of_velocity, di.Dahl(), {}),
+        (DataError, "at least 16", recorded(DAHL, "random", 12, 0.0), di.Dahl(), {}),
+        (DataError, "no record", [], di.Dahl(), {}),
+        (ModelError, "nothing is free", record, DAHL, {}),
+        (ModelError, "start names nothing", record, di.Dahl(), {"start": {"nothing": 1.0}}),
+        (
+            ValidationError,
+            "noise is given with records: ",
+            record,
+            di.Dahl(),
+            {"noise": "relative"},
+        ),
+        (ValidationError, "data holds a str", name, di.Dahl(), {}),
+    ]
+    for error, message, data, model, options in cases:
+        with pytest.raises(error, match=message):
+            di.fit(data, model, **options)
 
 
 @needs_measured
@@ -531,11 +538,8 @@ def test_results_of_records_are_copied_and_pickled():
     ]
     for result in results:
         expected = dict(result.params)  # known before it is copied
-        for copied in (
-            copy.copy(result),
-            copy.deepcopy(result),
-            pickle.loads(pickle.dumps(result)),
-        ):
+        for way in (copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))):
+            copied: Any = way(result)
             for name, p in copied.params.items():
                 assert p.value == expected[name].value
                 assert (p.stderr or 0.0) == pytest.approx(expected[name].stderr or 0.0, rel=1e-9)

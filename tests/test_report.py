@@ -16,6 +16,7 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.document import Cell, Document, Paragraph, Section, TextTable
 from dahl_ident.reporting.pdf import pdf
 from tests.browser import CHROMIUM, chromium
+from tests.friction_tables import PLANT, driven, table
 
 NASTY = "<img src=x onerror=alert(1)>&\"'|*_`[x](y)#.csv"
 WIDTHS = (400, 1400)
@@ -23,18 +24,13 @@ WIDTHS = (400, 1400)
 
 @pytest.fixture(scope="module")
 def fit():
-    amplitude = np.geomspace(3e-4, 3e-2, 20)
-    random = np.random.default_rng(1)
-    noise = 0.01 * (random.standard_normal(20) + 1j * random.standard_normal(20))
-    response = di.Dahl(0.1, 30.0).describing_function(amplitude) * np.exp(noise)
     provenance = {"file": NASTY, "sha256": "ab" * 32, "options": "x", "notes": ["zero to peak"]}
-    data = di.FrequencyResponse(np.ones(20), response, amplitude, provenance=provenance)
-    return di.fit(data, di.Dahl())
+    return di.fit(replace(table(n=20), provenance=provenance), di.Dahl())
 
 
 @pytest.fixture(scope="module")
 def posterior(fit):
-    return di.posterior(fit, seed=3, ess=500.0, uncertainty="noise")
+    return di.posterior(fit, seed=3, ess=200.0, uncertainty="noise")
 
 
 @pytest.fixture(scope="module")
@@ -88,13 +84,8 @@ def test_html_tells_the_numbers_side_by_side(page_file, fit):
     for method in ("Wald 95.45 %", "profile 95.45 %", "posterior 95.45 %"):
         assert method in text
     assert f'data-value="{fit.params["f_max"].value}"' in text
-    for fact in (
-        "ab" * 32,
-        f"dahl_ident {di.__version__}, python",
-        "Seed 3",
-        "dahl-ident fit",
-        "Zero to peak",
-    ):
+    software = f"dahl_ident {di.__version__}, python"
+    for fact in ("ab" * 32, software, "Seed 3", "dahl-ident fit", "Zero to peak"):
         assert fact in text
 
 
@@ -138,24 +129,18 @@ def test_pdf_has_text_pictures_and_outline(fit, tmp_path):
         assert fact in text
     assert sum(len(page.images) for page in reader.pages) >= 5
     assert next(item.title for item in reader.outline) == "Result"
-    assert {(round(p.mediabox.width), round(p.mediabox.height)) for p in reader.pages} == {
-        (595, 842)
-    }
+    sizes = {(round(p.mediabox.width), round(p.mediabox.height)) for p in reader.pages}
+    assert sizes == {(595, 842)}
 
 
 def test_headings_and_captions_in_pdf_stay_with_what_they_head():
     pypdf = pytest.importorskip("pypdf")
-    sections = tuple(
-        Section(
-            f"heading {i}.",
-            (
-                TextTable(
-                    f"caption {i}.", ("x",), tuple((Cell(f"row {i}.{j}."),) for j in range(i))
-                ),
-            ),
-        )
-        for i in range(1, 25)
-    )
+
+    def section(i):
+        rows = tuple((Cell(f"row {i}.{j}."),) for j in range(i))
+        return Section(f"heading {i}.", (TextTable(f"caption {i}.", ("x",), rows),))
+
+    sections = tuple(map(section, range(1, 25)))
     whole = Document(title="t", status="trusted", verdict=("v",), sections=sections)
     pages = [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(pdf(whole))).pages]
     assert len(pages) > 5
@@ -195,15 +180,8 @@ def test_a_fit_that_ran_away_is_not_trusted(tmp_path):
 
 @pytest.mark.pictures
 def test_a_plant_over_frequency_is_reported(tmp_path):
-    frequency, drive = (
-        g.ravel() for g in np.meshgrid(np.geomspace(0.1, 3.0, 5), [0.05, 0.15, 1.0])
-    )
-    plant = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
-    steady = di.response(plant, frequency, drive)
-    data = di.FrequencyResponse(
-        frequency, steady.displacement / drive, drive=drive, level=drive, controlled="force",
-        quantity="receptance",
-    )  # fmt: skip
+    f, u = np.tile(np.geomspace(0.1, 3.0, 5), 3), np.repeat([0.05, 0.15, 1.0], 5)
+    data = driven(f, di.response(PLANT, f, u).receptance, u, level=u)
     free = di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring()
     place = report(di.fit(data, free), tmp_path / "plant.html", title="A plant")
     text = place.read_text(encoding="utf-8")
@@ -325,18 +303,11 @@ def test_measured_loops_and_settling_are_shown(tmp_path):
     with pytest.raises(ValidationError, match="not extracted from this record"):
         report(fit, tmp_path / "other.html", record=other)
     with pytest.raises(ValidationError, match="not extracted from this record"):
-        report(di.fit(plain_table(), di.Dahl()), tmp_path / "other.html", record=record)
-
-
-def plain_table():
-    amplitude = np.geomspace(3e-4, 3e-2, 12)
-    noise = 0.01 * np.random.default_rng(1).standard_normal((2, 12))
-    response = di.Dahl(0.1, 30.0).describing_function(amplitude) * np.exp(noise[0] + 1j * noise[1])
-    return di.FrequencyResponse(np.ones(12), response, amplitude)
+        report(di.fit(table(n=12), di.Dahl()), tmp_path / "other.html", record=record)
 
 
 def test_the_bootstrap_stands_next_to_the_others_once_it_was_run(tmp_path):
-    fit = di.fit(plain_table(), di.Dahl())
+    fit = di.fit(table(n=12), di.Dahl())
     before = report(fit, tmp_path / "a.md").read_text(encoding="utf-8")
     assert "bootstrap" not in before
     fit.conf_interval("bootstrap", replicates=200)
@@ -344,10 +315,15 @@ def test_the_bootstrap_stands_next_to_the_others_once_it_was_run(tmp_path):
     assert "| bootstrap 95.45 % |" in after
 
 
-def test_pdf_shows_characters_that_its_font_lacks(fit, tmp_path):
-    pypdf = pytest.importorskip("pypdf")
-    place = report(fit, tmp_path / "r.pdf", title="pivot \u65e5 \u03a9")
-    assert pypdf.PdfReader(place).pages[0].extract_text().startswith("pivot <U+65E5> \u03a9")
+def first_page(title):
+    """Return the text of the first page of a report without sections."""
+    whole = Document(title=title, status="trusted", verdict=("Holds.",), sections=())
+    pages = pytest.importorskip("pypdf").PdfReader(io.BytesIO(pdf(whole))).pages
+    return str(pages[0].extract_text())
+
+
+def test_pdf_shows_characters_that_its_font_lacks():
+    assert first_page("pivot \u65e5 \u03a9").startswith("pivot <U+65E5> \u03a9")
 
 
 @pytest.mark.parametrize(
@@ -356,22 +332,19 @@ def test_pdf_shows_characters_that_its_font_lacks(fit, tmp_path):
     ids=["half a character", "long", "many words"],
 )
 def test_titles_that_no_page_has_room_for(fit, tmp_path, title, printed):
-    pypdf = pytest.importorskip("pypdf")
     place = report(fit, tmp_path / "r.json", title=title)
     found = json.loads(place.read_text(encoding="utf-8"))["title"]
     assert found.startswith(printed)
-    whole = Document(title=found, status="trusted", verdict=("Holds.",), sections=())
     assert printed in report(fit, tmp_path / "r.html", title=title).read_text(encoding="utf-8")
-    page = pypdf.PdfReader(io.BytesIO(pdf(whole))).pages[0].extract_text()
+    page = first_page(found)
     assert page.replace("\n", "").startswith(printed)
     assert page.endswith("Page 1 of 1")
 
 
 def test_files_and_the_files_that_those_were_made_from_are_listed(tmp_path):
     origin = {"file": "raw.csv", "sha256": "1" * 64, "extraction": {"mode": "steps"}}
-    data = replace(
-        plain_table(), provenance={"file": "levels.csv", "sha256": "2" * 64, "origin": origin}
-    )
+    read = {"file": "levels.csv", "sha256": "2" * 64, "origin": origin}
+    data = replace(table(n=12), provenance=read)
     text = report(di.fit(data, di.Dahl()), tmp_path / "r.md").read_text(encoding="utf-8")
     assert text.startswith("# Friction identified from levels.csv\n")
     for row in (
@@ -417,12 +390,12 @@ def test_of_several_fits_each_verdict_names_its_model(fit, tmp_path):
 
 def test_a_fit_with_constraints_is_reported(tmp_path):
     """Without profiles, which would not keep them."""
-    fit = di.fit(
-        di.load_dataset("noisy"),
-        di.Dahl(alpha=1.0),
-        method="ipopt",
-        constraints=lambda p: [p["sigma"] == 300 * p["f_max"]],
-    )
+
+    def constraints(p):
+        return [p["sigma"] == 300 * p["f_max"]]
+
+    data, law = di.load_dataset("noisy"), di.Dahl(alpha=1.0)
+    fit = di.fit(data, law, method="ipopt", constraints=constraints)
     text = di.report(fit, tmp_path / "report.md").read_text("utf-8")
     assert "Wald 95.45 %" in text
     assert "profile" not in text.split("## Parameters")[1].split("## ")[0]
