@@ -153,9 +153,8 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path, command):
     ],
 )
 def test_closed_streams(tmp_path, command, status, says):
-    ended = subprocess.run(
-        ["sh", "-c", f"exec {PROGRAM} {command}"], stderr=subprocess.PIPE, cwd=tmp_path
-    )
+    words = ["sh", "-c", f"exec {PROGRAM} {command}"]
+    ended = subprocess.run(words, stderr=subprocess.PIPE, cwd=tmp_path)
     assert (ended.returncode, ended.stderr) == (status, says)
     assert list(tmp_path.iterdir()) == ([] if status else [tmp_path / "n.csv"])
 
@@ -180,12 +179,8 @@ def test_of_two_writers_one_fails(tmp_path, monkeypatch):
         "friction_table().save(sys.argv[1])"
     )
     place.unlink()
-    several = [
-        subprocess.Popen(
-            [sys.executable, "-c", program, place], stdin=subprocess.PIPE, stderr=subprocess.PIPE
-        )
-        for _ in range(3)
-    ]
+    words, pipe = [sys.executable, "-c", program, place], subprocess.PIPE
+    several = [subprocess.Popen(words, stdin=pipe, stderr=pipe) for _ in range(3)]
     ended = [one.communicate(b"x") for one in several]
     assert sorted(one.returncode for one in several) == [0, 1, 1]
     assert sum(b"exists already" in err for _, err in ended) == 2
@@ -219,18 +214,12 @@ def test_a_name_that_is_no_text_is_told_and_reported(run):
     assert "l\\udcff.csv" in Path("r.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("fit", "levels.csv", "--report", "{}"),
-        ("fit", "levels.csv", "--save", "{}"),
-        ("report", "levels.csv", "-o", "{}"),
-        ("sample", "levels.csv", "--report", "{}"),
-        ("datasets", "noisy", "-o", "{}"),
-        ("simulate", "--f-max", "1", "--sigma", "2", "-o", "{}"),
-    ],
-)
-def test_a_place_that_cannot_be_is_refused_before_any_work(run, arguments):
+@pytest.mark.parametrize("command", [
+    "fit levels.csv --report {}", "fit levels.csv --save {}", "report levels.csv -o {}",
+    "sample levels.csv --report {}", "datasets noisy -o {}",
+    "simulate --f-max 1 --sigma 2 -o {}",
+])  # fmt: skip
+def test_a_place_that_cannot_be_is_refused_before_any_work(run, command):
     Path("file.json").write_text("mine", encoding="utf-8")
     Path("folder.json").mkdir()
     Path("levels.csv").write_text("no table, so that any work would end with another error")
@@ -239,25 +228,20 @@ def test_a_place_that_cannot_be_is_refused_before_any_work(run, arguments):
         "file.json/new.json": "file.json/new.json: there is no folder file.json; make it",
         "folder.json": "folder.json is a folder; give the path of a file in it",
     }.items():
-        assert run.refused(*(a.format(place) for a in arguments)).startswith(f"error: {says}")
+        assert run.refused(*command.format(place).split()).startswith(f"error: {says}")
     assert sorted(p.name for p in Path().iterdir()) == ["file.json", "folder.json", "levels.csv"]
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("fit", "levels.csv", "--save", "/proc/new.json"),
-        ("report", "levels.csv", "-o", "/proc/new.html"),
-        ("sample", "levels.csv", "--resume", "/proc/new.h5"),
-        ("datasets", "noisy", "-o", "/proc/new.csv"),
-        ("demo", "-o", "/proc/new"),
-    ],
-)
-def test_a_folder_that_takes_no_files_is_one_line(run, arguments):
+@pytest.mark.parametrize("command", [
+    "fit levels.csv --save /proc/new.json", "report levels.csv -o /proc/new.html",
+    "sample levels.csv --resume /proc/new.h5", "datasets noisy -o /proc/new.csv",
+    "demo -o /proc/new",
+])  # fmt: skip
+def test_a_folder_that_takes_no_files_is_one_line(run, command):
     friction_table().save("levels.csv")
-    error = run.refused(*arguments)
-    assert error.startswith(f"error: {arguments[-1]}")
+    error = run.refused(*command.split())
+    assert error.startswith(f"error: {command.split()[-1]}")
     assert "cannot be" in error
 
 

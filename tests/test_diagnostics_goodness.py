@@ -16,8 +16,10 @@ from tests.friction_tables import (
     PLANT,
     X_C,
     amplitudes,
+    driven,
     plant_table,
     relative_noise,
+    stated,
     table,
 )
 
@@ -58,8 +60,7 @@ class TestSilence:
 
     def test_known_noise(self):
         data = table(seed=2)
-        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
-        found = judge(replace(data, covariance=C))
+        found = judge(replace(data, covariance=stated(data.response, 0.01)))
         (test,) = found.of("chi-square")
         assert test.p_value == pytest.approx(stats.chi2(58).sf(test.values["value"]))
         assert found.acceptable
@@ -132,11 +133,8 @@ class TestDepartures:
 
     def test_the_size_does_not_depend_on_the_claimed_noise(self):
         data = swept_table(0.28)
-        C = (1e-3 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
-        for claimed in (
-            replace(data, covariance=C),
-            replace(data, covariance=C, dof=np.full(32, 5.0)),
-        ):
+        known = replace(data, covariance=stated(data.response, 1e-3))
+        for claimed in (known, replace(known, dof=np.full(32, 5.0))):
             (trend,) = (t for t in judge(claimed).of("trend") if t.about == "frequency")
             assert np.expm1(trend.values["stiffness"].value) == pytest.approx(-0.28, abs=0.08)
             assert trend.p_value < 1e-9
@@ -164,8 +162,7 @@ class TestDepartures:
 
     def test_noise_larger_than_the_covariance_says(self):
         data = table(noise=0.03)
-        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
-        known = replace(data, covariance=C)
+        known = replace(data, covariance=stated(data.response, 0.01))
         found = judge(known)
         assert not found.acceptable
         assert "chi-square" in found.headline
@@ -173,7 +170,8 @@ class TestDepartures:
         assert unused.scatter == pytest.approx(3.0, rel=0.3)
         assert unused.acceptable
         assert ", but the scatter is 2.6 times what the data's covariance states" in unused.headline
-        assert "scatter" not in judge(replace(data, covariance=9.0 * C), noise="relative").headline
+        right = replace(data, covariance=stated(data.response, 0.03))
+        assert "scatter" not in judge(right, noise="relative").headline
 
     def test_a_third_harmonic_of_another_size(self):
         A = np.repeat(np.geomspace(0.5, 20.0, 12), 2) * X_C
@@ -266,8 +264,7 @@ class TestPhysics:
         f = np.tile(np.geomspace(0.1, 20.0, 6), 2)
         u = np.repeat([0.05, 0.3], 6)
         R = response(plant, f, u).receptance * relative_noise(12, 0.001, 3)
-        data = FrequencyResponse(f, R, drive=u, controlled="force", quantity="receptance")
-        assert not fit(data, Dahl() + Mass() + Damper() + Spring()).goodness.warnings
+        assert not fit(driven(f, R, u), Dahl() + Mass() + Damper() + Spring()).goodness.warnings
 
 
 class TestComparison:

@@ -10,7 +10,7 @@ from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_
 from dahl_ident.diagnostics import VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import SIGN_CHANGES, neighbourhood
 from dahl_ident.errors import FitError
-from tests.friction_tables import FRICTION, X_C, plant_table, relative_noise, table
+from tests.friction_tables import FRICTION, X_C, plant_table, relative_noise, stated, table
 
 MODEL = Dahl(alpha=1.0) + Mass(0.3) + Damper() + Spring()
 CONJUGATED, NEGATED, BOTH = SIGN_CHANGES
@@ -146,12 +146,8 @@ class TestSign:
 def test_the_error_of_an_exponent_asked_for_follows_the_scatter():
     """A covariance that claims a third of the noise narrows the error no more."""
     data = table(model=Dahl(0.1, 30.0, alpha=1.2), noise=0.03)
-    C = (0.03 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
-    told = [
-        fit(replace(data, covariance=C / 3.0**k), Dahl(alpha=1.0)).goodness.of("exponent")[0]
-        for k in (0, 2)
-    ]
-    honest, claimed = told
+    tables = (replace(data, covariance=stated(data.response, share)) for share in (0.03, 0.01))
+    (honest,), (claimed,) = (fit(t, Dahl(alpha=1.0)).goodness.of("exponent") for t in tables)
     assert claimed.values["stderr"] == pytest.approx(honest.values["stderr"], rel=0.4)
     assert claimed.values["widened"] == pytest.approx(3.0, rel=0.4)
     assert "(error widened " in str(claimed)

@@ -10,6 +10,7 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.ipopt import solve_ipopt
 from dahl_ident.problem import ProblemBatch, TableProblem
+from tests.friction_tables import driven, relative_noise
 from tests.test_generic_friction import jenkins
 
 
@@ -57,11 +58,7 @@ TRUTH |= {"mass": MASS, "damping": DAMPING, "stiffness": SPRING}
 
 
 def noisy(values, level=0.005, seed=1):
-    rng = np.random.default_rng(seed)
-    return np.asarray(
-        values
-        * np.exp(level * (rng.normal(size=values.shape) + 1j * rng.normal(size=values.shape)))
-    )
+    return values * relative_noise(values.size, level, seed)
 
 
 def alone():
@@ -76,9 +73,7 @@ def plant(controlled):
     Z = jenkins(STIFF, DELTA, A) + SPRING - MASS * omega**2 + 1j * DAMPING * omega
     if controlled == "displacement":
         return di.FrequencyResponse(f, noisy(Z), A)
-    return di.FrequencyResponse(
-        f, noisy(1.0 / Z), drive=A * np.abs(Z), controlled="force", quantity="receptance"
-    )
+    return driven(f, noisy(1.0 / Z), A * np.abs(Z))
 
 
 def assert_truth(found):

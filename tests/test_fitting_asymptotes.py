@@ -6,6 +6,7 @@ import pytest
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.problem import ProblemBatch, TableProblem
+from tests.friction_tables import driven
 from tests.random_problems import friction_and_spring
 
 n = 24
@@ -130,9 +131,7 @@ def test_limits_hold_for_driven_plants(friction, status):
     f = np.geomspace(0.05, 5.0, n)[np.random.default_rng(0).permutation(n)]
     omega = 2.0 * np.pi * f
     Z = friction + 7.0 - 0.3 * omega**2 + 0.24j * omega
-    data = FrequencyResponse(
-        f, 1.0 / Z, drive=A * np.abs(Z), controlled="force", quantity="receptance"
-    )
+    data = driven(f, 1.0 / Z, A * np.abs(Z))
     plant = Dahl() + Mass() + Damper() + Spring()
     found = solve(TableProblem(data, plant, steady="describing function"))  # which made the data
     assert found.status is status

@@ -1,6 +1,7 @@
 """Harmonics of the displacement of driven plants, as rows of a table: X_k over the force."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.problem import TableProblem
 from dahl_ident.synthetic import Experiment, SteppedSine, Table
 from tests.derivatives import central_differences
+from tests.friction_tables import driven, stated
 from tests.recovery import assert_near
 
 KNOWN = di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
@@ -35,12 +37,10 @@ def asymmetric():
     rng = np.random.default_rng(2)
     real, imag = 0.002 * size * rng.standard_normal((2, row.size))
     R = R + real + 1j * np.where(k == 0, 0.0, imag)
-    covariance = (0.002 * size[:, None, None]) ** 2 * np.eye(2)
+    covariance = stated(size, 0.002)
     covariance[k == 0, 1, 1] = 0.0
-    return di.FrequencyResponse(
-        f[row], np.where(k == 0, R.real, R), drive=u[row], harmonic=k, covariance=covariance,
-        controlled="force", quantity="receptance",
-    )  # fmt: skip
+    data = driven(f[row], np.where(k == 0, R.real, R), u[row], harmonic=k)
+    return replace(data, covariance=covariance)
 
 
 @functools.cache

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident import Damper, FrequencyResponse, Iwan, Mass, MaxwellSlip, response
+from dahl_ident import Damper, Iwan, Mass, MaxwellSlip, response
 from dahl_ident.errors import ValidationError
 from dahl_ident.problem import TableProblem
+from tests.friction_tables import driven
 from tests.motions import Driven, differences, slopes
 from tests.recovery import assert_near
 from tests.test_forced_motion import RATE, multisine
@@ -98,10 +99,7 @@ def test_a_step_beyond_the_exponents_range_has_no_response():
     model = Iwan(ratio=1.0) + Mass() + Damper()
     true = Iwan(10.0, 1e4, -0.5, 1.0) + Mass(1.0) + Damper(1.0)
     f, drive = np.array([10.0, 15.0]), np.array([1.0, 2.0])
-    motion = response(true, f, drive)
-    data = FrequencyResponse(
-        f, motion.displacement / drive, drive=drive, quantity="receptance", controlled="force"
-    )
+    data = driven(f, response(true, f, drive).receptance, drive)
     problem = TableProblem(data, model)
     inside = problem.to_search([10.0, 1e4, -0.5, 1.0, 1.0])
     beyond = inside + np.array([0.0, 0.0, -1.3, 0.0, 0.0])

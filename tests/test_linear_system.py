@@ -23,13 +23,9 @@ def transfer_function(quantity):
     s = control.tf("s")
     Z = M * s**2 + C * s + K
     return {
-        "receptance": 1 / Z,
-        "mobility": s / Z,
-        "accelerance": s**2 / Z,
-        "dynamic_stiffness": Z,
-        "mechanical_impedance": Z / s,
-        "apparent_mass": Z / s**2,
-    }[quantity]
+        "receptance": 1 / Z, "mobility": s / Z, "accelerance": s**2 / Z, "dynamic_stiffness": Z,
+        "mechanical_impedance": Z / s, "apparent_mass": Z / s**2,
+    }[quantity]  # fmt: skip
 
 
 def relative_error(value, truth=STIFFNESS):
@@ -40,28 +36,20 @@ def relative_error(value, truth=STIFFNESS):
 def test_every_quantity_of_one_mode_is_the_same_stiffness(quantity):
     element = LinearSystem(transfer_function(quantity), quantity=quantity)
     assert relative_error(element.dynamic_stiffness(1e-3, OMEGA)) < 1e-12
-    frd = control.frd(transfer_function(quantity), OMEGA)
-    assert (
-        relative_error(LinearSystem(frd, quantity=quantity).dynamic_stiffness(1e-3, OMEGA)) < 1e-12
-    )
+    frd = LinearSystem(control.frd(transfer_function(quantity), OMEGA), quantity=quantity)
+    assert relative_error(frd.dynamic_stiffness(1e-3, OMEGA)) < 1e-12
 
 
 @pytest.mark.parametrize("quantity", INVERSE)
 def test_state_space_agrees_with_the_lumped_elements(quantity):
     element = LinearSystem(control.ss(transfer_function(quantity)), quantity=quantity)
-    lumped = Mass(M) + Damper(C) + Spring(K)
-    assert (
-        relative_error(
-            element.dynamic_stiffness(1e-3, OMEGA), lumped.dynamic_stiffness(1e-3, OMEGA)
-        )
-        < 1e-11
-    )
+    lumped = (Mass(M) + Damper(C) + Spring(K)).dynamic_stiffness(1e-3, OMEGA)
+    assert relative_error(element.dynamic_stiffness(1e-3, OMEGA), lumped) < 1e-11
 
 
 def two_modes(omega):
-    return np.asarray(
-        1.0 / (4.0 - omega**2 + 0.04j * omega) + 0.5 / (100.0 - omega**2 + 0.2j * omega)
-    )
+    first, second = (k - omega**2 + 1j * c * omega for k, c in ((4.0, 0.04), (100.0, 0.2)))
+    return np.asarray(1.0 / first + 0.5 / second)
 
 
 def test_frd_between_its_points_follows_two_modes_that_a_receptance_spline_misses():

@@ -32,15 +32,11 @@ def table(seed, dof=None):
     rng = np.random.default_rng(seed)
     C, n = covariances(), AMPLITUDES.size
     e = np.array([rng.multivariate_normal([0.0, 0.0], c) for c in C])
+    Z = predicted(F_MAX, SIGMA, ASYMMETRY) + e @ np.array([1.0, 1.0j])
     return di.FrequencyResponse(
-        np.full(4 * n, 2.0),
-        predicted(F_MAX, SIGMA, ASYMMETRY) + e @ np.array([1.0, 1.0j]),
-        np.tile(AMPLITUDES, 4),
-        harmonic=np.repeat(HARMONICS, n),
-        covariance=C,
-        dof=None if dof is None else np.full(4 * n, dof),
-        quantity="dynamic_stiffness",
-    )
+        np.full(4 * n, 2.0), Z, np.tile(AMPLITUDES, 4), harmonic=np.repeat(HARMONICS, n),
+        covariance=C, dof=None if dof is None else np.full(4 * n, dof),
+    )  # fmt: skip
 
 
 def whitened(values, data):

@@ -119,41 +119,24 @@ class TestChannels:
 
 class TestTables:
     @pytest.mark.parametrize("ending", [".csv", ".csv.gz", ".tsv", ".parquet", ".h5"])
-    @pytest.mark.parametrize(
-        "record",
-        [
-            sine(),
-            sine(motion="rotation", drive=TIME / 3, drive_unit="N m"),
-            sine(force=None, drive=TIME / 7, drive_factor=2.5, drive_factor_uncertainty=0.01),
-            sine(drive=TIME, drive_unit="A"),
-            sine(displacement=None, acceleration=TIME / 9),
-        ],
-    )
+    @pytest.mark.parametrize("record", [
+        sine(), sine(motion="rotation", drive=TIME / 3, drive_unit="N m"),
+        sine(force=None, drive=TIME / 7, drive_factor=2.5, drive_factor_uncertainty=0.01),
+        sine(drive=TIME, drive_unit="A"), sine(displacement=None, acceleration=TIME / 9),
+    ])  # fmt: skip
     def test_files_lose_nothing(self, tmp_path, record, ending):
         back = read_record(record.save(tmp_path / f"run{ending}"))
         assert_same(record, back)
 
     def test_repr_shows_sampling_ranges_units(self):
-        text = repr(
-            Record(
-                np.r_[TIME[:9], TIME[12:]],
-                velocity=np.zeros(197),
-                drive=np.ones(197),
-                drive_factor=2.0,
-                motion="rotation",
-                provenance={"file": "run.csv", "notes": ["something assumed"]},
-            )
-        )
+        told = {"file": "run.csv", "notes": ["something assumed"]}
+        text = repr(Record(
+            np.r_[TIME[:9], TIME[12:]], velocity=np.zeros(197), drive=np.ones(197),
+            drive_factor=2.0, motion="rotation", provenance=told,
+        ))  # fmt: skip
         facts = (
-            "197 samples of velocity in rotation",
-            "50 Hz, uneven, 3.98 s",
-            "gaps",
-            "0 rad/s",
-            "1 V",
-            "2 N m/V within 0 %",
-            "run.csv",
-            "something assumed",
-        )
-        for fact in facts:
-            assert fact in text, fact
+            "197 samples of velocity in rotation", "50 Hz, uneven, 3.98 s", "gaps", "0 rad/s",
+            "1 V", "2 N m/V within 0 %", "run.csv", "something assumed",
+        )  # fmt: skip
+        assert [fact for fact in facts if fact not in text] == []
         assert "<table>" in sine()._repr_html_()

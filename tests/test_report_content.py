@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +20,7 @@ import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
 from tests.browser import CHROMIUM, chromium
+from tests.friction_tables import relative_noise
 
 METADATA: dict[str, Any] = {
     "specimen": "Flex pivot 12",
@@ -36,8 +38,7 @@ SCHEMA = json.loads((files("dahl_ident.reporting") / "report.schema.json").read_
 
 def measured(f_max, seed, *, amplitudes=(3e-4, 3e-2), file=""):
     A = np.geomspace(amplitudes[0], amplitudes[1], 20)
-    scatter = 0.01 * np.random.default_rng(seed).standard_normal((2, 20))
-    response = di.Dahl(f_max, 30.0).describing_function(A) * np.exp(scatter[0] + 1j * scatter[1])
+    response = di.Dahl(f_max, 30.0).describing_function(A) * relative_noise(20, 0.01, seed)
     provenance = {"file": file, "sha256": "ab" * 32} if file else None
     return di.FrequencyResponse(np.ones(20), response, A, provenance=provenance)
 
@@ -49,10 +50,14 @@ def text_of(*results, metadata=None):
         return place.read_text("utf-8").replace("\\", "")
 
 
-def change_of(name, fits, place):
-    """Return what a report says of the change of one parameter."""
-    facts = json.loads(report(fits, place, overwrite=True).read_text("utf-8"))
-    return next(change for change in facts["changes"] if change["parameter"] == name)
+def facts_of(results, place, **options):
+    """Return a report as data."""
+    return json.loads(report(results, place, overwrite=True, **options).read_text("utf-8"))
+
+
+def changes_of(facts):
+    """Return what a report says of the change of each parameter."""
+    return {change["parameter"]: change for change in facts["changes"]}
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +100,7 @@ def test_what_nobody_stated_is_a_line_to_fill_in(fit, tmp_path):
 def test_metadata_from_a_file(fit, tmp_path):
     place = tmp_path / "lab.toml"
     place.write_text('specimen = "S 1"\nmeasured = 2026-11-20\n[ambient]\nhumidity = "41 %"\n')
-    facts = json.loads(report(fit, tmp_path / "r.json", metadata=place).read_text("utf-8"))
+    facts = facts_of(fit, tmp_path / "r.json", metadata=place)
     assert facts["metadata"]["specimen"] == "S 1"
     assert facts["metadata"]["measured"] == "2026-11-20"
     assert facts["metadata"]["ambient"] == ["humidity 41 %"]
@@ -125,7 +130,7 @@ def test_the_hash_is_that_of_the_file_that_was_read(tmp_path, run):
     place = tmp_path / "noisy.csv"
     assert run("datasets", "noisy", "-o", str(place)).status == 0
     again = di.fit(di.read_frequency_response(place), di.Dahl())
-    facts = json.loads(report(again, tmp_path / "r.json").read_text("utf-8"))
+    facts = facts_of(again, tmp_path / "r.json")
     read = [one for one in facts["files"] if one["read"]]
     assert [Path(one["file"]).name for one in read] == ["noisy.csv"]
     assert read[0]["sha256"] == hashlib.sha256(place.read_bytes()).hexdigest()
@@ -163,10 +168,8 @@ def test_what_must_not_be_used_is_crossed_out_with_its_reason(fit, microslip, tm
     assert rows["f_max"][1].startswith("~~")
     assert "not determined, because no amplitude" in rows["f_max"][-1]
     assert not any("~~" in cell for cell in rows["sigma"])
-    not_dahl = measured(0.1, 1)
-    bent = di.FrequencyResponse(
-        np.ones(20), not_dahl.response * (1 + 2 * (np.arange(20) % 2)), not_dahl.amplitude
-    )
+    dahl = measured(0.1, 1)
+    bent = replace(dahl, response=dahl.response * (1 + 2 * (np.arange(20) % 2)))
     text = text_of(di.fit(bent, di.Dahl(), throw=False))
     assert "Derived: " not in text
     for table, columns in (("## Parameters", slice(1, 3)), ("## Stiffness and d", slice(1, None))):
@@ -192,18 +195,16 @@ def runs(f_max, seed, scatter, count):
     """Return a fit of some runs between which the friction scatters, exactly by its share."""
     rng = np.random.default_rng(seed)
     shares = 1.0 + scatter * stats.zscore(rng.standard_normal(count), ddof=1)
-    tables = []
-    for i, share in enumerate(shares):
-        one = measured(f_max * share, 100 * seed + i)
-        run = np.full(one.n, f"day {i + 1}")
-        tables.append(di.FrequencyResponse(one.frequency_hz, one.response, one.amplitude, run=run))
+    tables = [
+        replace(measured(f_max * share, 100 * seed + i), run=np.full(20, f"day {i + 1}"))
+        for i, share in enumerate(shares)
+    ]
     return di.fit(di.FrequencyResponse.concatenate(tables), di.Dahl(alpha=1.0))
 
 
 def test_two_devices_are_overlaid_and_their_changes_judged(tmp_path):
     fit, later = runs(0.1, 1, 0.01, 4), runs(0.15, 2, 0.01, 4)
-    facts = json.loads(report([fit, later], tmp_path / "r.json").read_text("utf-8"))
-    found = {change["parameter"]: change for change in facts["changes"]}
+    found = changes_of(facts_of([fit, later], tmp_path / "r.json"))
     assert found["f_max"]["significant"]
     assert not found["sigma"]["significant"]
     for name, change in found.items():
@@ -220,26 +221,26 @@ def test_two_devices_are_overlaid_and_their_changes_judged(tmp_path):
 def test_scatter_between_runs_counts_in_the_change_of_a_single_run(fit, tmp_path):
     """A single day compared with four: its own scatter is that of the four."""
     several = runs(0.103, 3, 0.02, 4)
-    change = change_of("f_max", [fit, several], tmp_path / "r.json")
+    change = changes_of(facts_of([fit, several], tmp_path / "r.json"))["f_max"]
     assert change["runs_known"]
     assert change["u"] > 0.02 * 0.1, "one day of a device that scatters by 2 % between days"
     assert not change["significant"]
     later = di.fit(measured(0.1, 2), di.Dahl())
-    assert not change_of("f_max", [fit, later], tmp_path / "r.json")["runs_known"]
+    alone = changes_of(facts_of([fit, later], tmp_path / "r.json"))
+    assert not alone["f_max"]["runs_known"]
 
 
 def test_two_single_runs_leave_open_whether_the_device_changed(fit, tmp_path):
     later = di.fit(measured(0.11, 2, file="later.csv"), di.Dahl())
-    facts = json.loads(report([fit, later], tmp_path / "r.json").read_text("utf-8"))
+    facts = facts_of([fit, later], tmp_path / "r.json")
     assert [file["file"] for file in facts["files"]] == ["pivot.csv", "later.csv"]
-    change = next(c for c in facts["changes"] if c["parameter"] == "f_max")
+    change = changes_of(facts)["f_max"]
     assert (change["p"] < 1e-4, change["significant"]) == (True, False)
     assert any("scatter between runs" in line for line in facts["verdict"])
 
 
 def test_a_change_of_what_is_not_determined_is_not_judged(fit, microslip, tmp_path):
-    facts = json.loads(report([fit, microslip], tmp_path / "r.json").read_text("utf-8"))
-    found = {change["parameter"]: change for change in facts["changes"]}
+    found = changes_of(facts_of([fit, microslip], tmp_path / "r.json"))
     assert (found["f_max"]["p"], found["f_max"]["significant"]) == (None, False)
     assert found["sigma"]["p"] is not None
 
@@ -257,20 +258,16 @@ def test_two_saved_fits_say_what_changed(run, fit):
     as_json = json.loads(run("fit", "monday.json", "friday.json", "--json").out)
     assert {c["parameter"] for c in as_json} == {"f_max", "sigma"}
     di.fit(measured(50.0, 2, amplitudes=(0.15, 15.0)), di.Dahl()).save("other.json")
-    assert re.search(
-        r"f_max from other to monday: .* N \(-100 %, p < 0",
-        run("fit", "other.json", "monday.json").out,
-    )
+    told = run("fit", "other.json", "monday.json")
+    assert re.search(r"f_max from other to monday: .* N \(-100 %, p < 0", told.out)
 
 
 def test_equal_devices_seldom_change_significantly(tmp_path):
     """At 5 %, 2 parameters of 15 pairs: more than 6 significant ones have probability 0.1 %."""
-    fits = [di.fit(measured(0.1, seed), di.Dahl()) for seed in range(30)]
-    found = [
-        change_of(name, [a, b], tmp_path / "r.json")["p"] < 0.05
-        for a, b in zip(fits[::2], fits[1::2], strict=True)
-        for name in ("f_max", "sigma")
-    ]
+    fits, found = [di.fit(measured(0.1, seed), di.Dahl()) for seed in range(30)], []
+    for a, b in zip(fits[::2], fits[1::2], strict=True):
+        changes = changes_of(facts_of([a, b], tmp_path / "r.json"))
+        found += [changes[name]["p"] < 0.05 for name in ("f_max", "sigma")]
     assert len(found) == 30
     assert stats.binom.sf(sum(found) - 1, 30, 0.05) > 1e-3
 
@@ -279,8 +276,8 @@ def test_json_follows_the_published_schema(fit, microslip, tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
     chain = di.posterior(fit.data, di.Dahl(alpha=1.0), seed=1, steps=60)
     cases: tuple[list[Any], ...] = ([fit], [microslip], [fit, chain], [chain], [fit, microslip])
-    for i, results in enumerate(cases):
-        facts = json.loads(report(results, tmp_path / f"{i}.json").read_text("utf-8"))
+    for results in cases:
+        facts = facts_of(results, tmp_path / "r.json")
         jsonschema.validate(facts, SCHEMA)
     facts["fits"][0]["status"] = "fine"
     with pytest.raises(jsonschema.ValidationError):
@@ -305,10 +302,8 @@ def test_the_page_on_a4(fit, microslip, tmp_path):
                 assert _computed(page, what, "breakInside") == {"avoid"}, what
             assert _computed(page, "h2, .bar", "breakAfter") == {"avoid"}
             assert _computed(page, "nav, .copy", "display") == {"none"}
-            printed = [
-                sheet.extract_text()
-                for sheet in pypdf.PdfReader(io.BytesIO(page.print_to_pdf())).pages
-            ]
+            sheets = pypdf.PdfReader(io.BytesIO(page.print_to_pdf())).pages
+            printed = [sheet.extract_text() for sheet in sheets]
             page.call("Emulation.setEmulatedMedia", media="screen")
             sizes = {len(text.strip()) > 30 for text in printed}
             assert sizes == {True}, "no page is blank"
@@ -318,11 +313,9 @@ def test_the_page_on_a4(fit, microslip, tmp_path):
             assert pictures == signed + 1
             for i, text in enumerate(printed):
                 assert f"Page {i + 1} of {len(printed)}" in text
-            rows = [
-                i for i, t in enumerate(printed) if re.search(r"^1 +[0-9.e-]+ ", t, re.MULTILINE)
-            ]
+            rows = [t for t in printed if re.search(r"^1 +[0-9.e-]+ ", t, re.MULTILINE)]
             assert rows
-            assert all("frequency [Hz]" in printed[i] for i in rows), "the heading is repeated"
+            assert all("frequency [Hz]" in t for t in rows), "the heading is repeated"
 
 
 def test_pdf_marks_its_headings_for_reading_aloud(fit, tmp_path):
@@ -332,9 +325,8 @@ def test_pdf_marks_its_headings_for_reading_aloud(fit, tmp_path):
     elements = [element.get_object() for element in tree]
     tags = [element["/S"] for element in elements]
     for table in (element for element in elements if element["/S"] == "/Table"):
-        kinds = [
-            [cell.get_object()["/S"] for cell in row.get_object()["/K"]] for row in table["/K"]
-        ]
+        lines = [row.get_object()["/K"] for row in table["/K"]]
+        kinds = [[cell.get_object()["/S"] for cell in line] for line in lines]
         assert set(kinds[0]) == {"/TH"}
         assert {kind for row in kinds[1:] for kind in row} == {"/TD"}
         assert {len(row) for row in kinds} == {len(kinds[0])}
@@ -398,9 +390,8 @@ def test_an_uncertainty_without_its_meaning_is_refused(instrument, message):
 
 def test_number_title_hash_and_page_stand_on_every_page(tmp_path):
     pypdf = pytest.importorskip("pypdf")
-    counted = di.fit(
-        measured(0.1, 1, file="pivot.csv"), di.Dahl(), sensors=di.Sensors.from_metadata(CERTIFIED)
-    )
+    data, sensors = measured(0.1, 1, file="pivot.csv"), di.Sensors.from_metadata(CERTIFIED)
+    counted = di.fit(data, di.Dahl(), sensors=sensors)
     place = report(counted, tmp_path / "r.pdf", title="Pivot 12", metadata=CERTIFIED)
     pages = [page.extract_text() for page in pypdf.PdfReader(place).pages]
     for i, text in enumerate(pages, 1):
@@ -431,10 +422,9 @@ def test_a_table_and_waveforms_of_one_test_are_compared(f_max, tmp_path):
         di.fit(measured(0.1, 1), di.Dahl()),
         di.fit(di.Record(time, displacement=x, force=force), di.Dahl()),
     ]
-    place = report(fits, tmp_path / "both.json")
-    facts = json.loads(place.read_text("utf-8"))
+    facts = facts_of(fits, tmp_path / "both.json")
     pytest.importorskip("jsonschema").validate(facts, SCHEMA)
-    assert {change["parameter"] for change in facts["changes"]} == {"f_max", "sigma"}
+    assert changes_of(facts).keys() == {"f_max", "sigma"}
     assert ("f_max" in facts["disagree"]) is (f_max != 0.1)
     assert (facts["status"] == "not described") is (f_max != 0.1)
     first = facts["verdict"][0]

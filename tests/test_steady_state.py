@@ -42,12 +42,9 @@ def some_plants(count, alphas):
     plants = []
     for i in range(count):
         f_max, sigma, mass, damping, stiffness = 10.0 ** rng.uniform(-3.0, 3.0, 5)
-        plants.append(
-            Dahl(f_max, sigma, alphas[i % len(alphas)])
-            + Mass(mass)
-            + Damper(damping * rng.choice([0.0, 1e-6, 1.0]))
-            + Spring(stiffness * rng.choice([0.0, 1.0]))
-        )
+        damping, stiffness = damping * rng.choice([0.0, 1e-6, 1.0]), stiffness * rng.integers(2)
+        law = Dahl(f_max, sigma, alphas[i % len(alphas)])
+        plants.append(law + Mass(mass) + Damper(damping) + Spring(stiffness))
     return plants
 
 
@@ -70,13 +67,8 @@ def test_drives_over_24_decades(plant, frequency, share):
 
 
 def test_several_friction_elements_side_by_side():
-    plant = (
-        Dahl(1.0, 10.0, name="a")
-        + Dahl(0.01, 1e4, name="b")
-        + Dahl(5.0, 2.0, 2.0, name="c")
-        + Mass(0.3)
-        + Spring(0.01)
-    )
+    friction = Dahl(1.0, 10.0, name="a") + Dahl(0.01, 1e4, name="b") + Dahl(5.0, 2.0, 2.0, name="c")
+    plant = friction + Mass(0.3) + Spring(0.01)
     result = response(plant, [0.0, 0.1, 0.9, 25.0], WIDE)
     assert result.found.all()
     assert worst_residual(plant, result) < 1e-12

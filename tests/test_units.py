@@ -29,82 +29,44 @@ from dahl_ident.units import (
 POUND_FORCE = 0.45359237 * 9.80665  # international avoirdupois pound, standard gravity
 
 
+FACTORS: dict[float, str] = {  # texts apart by commas
+    1.0: "m,m/s2,m/s^2,m/s**2,m s⁻²,m s^-2,Nm,N m,N·m,N-m,N.m,sec,HZ,Newtons,Volts,1",
+    1e-6: "um,µm,μm,(mm/s)/kN",
+    1e-3: "mm/s²,mrad,ms,mV",
+    1e3: "kN*m,N/mm,kHz",
+    0.0254: "in,in/s",
+    25.4e-6: "mil,mils",
+    9.80665: "kgf,g_n",
+    math.pi / 180: "deg,°,Deg,º",
+    2 * math.pi / 60: "rpm",
+    POUND_FORCE: "lbf",
+    1000 * POUND_FORCE: "kip",
+    POUND_FORCE * 0.0254: "lbf-in,in-lbf",
+}
+
+
 @pytest.mark.parametrize(
-    ("text", "factor"),
-    [
-        ("m", 1.0),
-        ("um", 1e-6),
-        ("µm", 1e-6),
-        ("μm", 1e-6),
-        ("in", 0.0254),
-        ("mil", 25.4e-6),
-        ("mils", 25.4e-6),
-        ("in/s", 0.0254),
-        ("lbf", POUND_FORCE),
-        ("kip", 1000 * POUND_FORCE),
-        ("kgf", 9.80665),
-        ("m/s2", 1.0),
-        ("m/s^2", 1.0),
-        ("m/s**2", 1.0),
-        ("mm/s²", 1e-3),
-        ("m s⁻²", 1.0),
-        ("m s^-2", 1.0),
-        ("g_n", 9.80665),
-        ("Nm", 1.0),
-        ("N m", 1.0),
-        ("N·m", 1.0),
-        ("N-m", 1.0),
-        ("N.m", 1.0),
-        ("kN*m", 1e3),
-        ("lbf-in", POUND_FORCE * 0.0254),
-        ("in-lbf", POUND_FORCE * 0.0254),
-        ("N/mm", 1e3),
-        ("(mm/s)/kN", 1e-6),
-        ("deg", math.pi / 180),
-        ("°", math.pi / 180),
-        ("rpm", 2 * math.pi / 60),
-        ("mrad", 1e-3),
-        ("sec", 1.0),
-        ("ms", 1e-3),
-        ("HZ", 1.0),
-        ("Newtons", 1.0),
-        ("Volts", 1.0),
-        ("Deg", math.pi / 180),
-        ("º", math.pi / 180),
-        ("kHz", 1e3),
-        ("mV", 1e-3),
-        ("1", 1.0),
-    ],
+    ("text", "factor"), [(t, factor) for factor, texts in FACTORS.items() for t in texts.split(",")]
 )
 @pytest.mark.versions
 def test_factors(text, factor):
     assert parse_unit(text).factor == pytest.approx(factor, rel=1e-14)
 
 
+MARKERS: dict[tuple[str | None, float], str] = {
+    (None, 1.0): "um",
+    ("zero to peak", 1.0): "um pk,um peak,um 0-p,um zero-to-peak,mm 0p",
+    ("rms", math.sqrt(2)): "um rms,Vrms,m_RMS,um (rms)",
+    ("peak to peak", 0.5): "mm pp,mVpp,mm p-p,mm pk-pk,mm peak-to-peak,mm (p-p)",
+}
+
+
 @pytest.mark.parametrize(
-    ("text", "marker", "to_peak"),
-    [
-        ("um", None, 1.0),
-        ("um pk", "zero to peak", 1.0),
-        ("um peak", "zero to peak", 1.0),
-        ("um 0-p", "zero to peak", 1.0),
-        ("um zero-to-peak", "zero to peak", 1.0),
-        ("um rms", "rms", math.sqrt(2)),
-        ("Vrms", "rms", math.sqrt(2)),
-        ("m_RMS", "rms", math.sqrt(2)),
-        ("mm pp", "peak to peak", 0.5),
-        ("mVpp", "peak to peak", 0.5),
-        ("mm p-p", "peak to peak", 0.5),
-        ("mm pk-pk", "peak to peak", 0.5),
-        ("mm peak-to-peak", "peak to peak", 0.5),
-        ("mm (p-p)", "peak to peak", 0.5),
-        ("um (rms)", "rms", math.sqrt(2)),
-        ("mm 0p", "zero to peak", 1.0),
-    ],
+    ("text", "meaning"), [(t, known) for known, texts in MARKERS.items() for t in texts.split(",")]
 )
-def test_amplitude_markers(text, marker, to_peak):
+def test_amplitude_markers(text, meaning):
     unit = parse_unit(text)
-    assert (unit.marker, unit.to_peak) == (marker, to_peak)
+    assert (unit.marker, unit.to_peak) == meaning
 
 
 @pytest.mark.parametrize(
