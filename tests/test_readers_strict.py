@@ -10,6 +10,7 @@ import socket
 import warnings
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -474,3 +475,16 @@ class TestUnderstood:
                 content = json.loads(fit.to_json()) | {"schema_version": version}
                 with pytest.raises(DataError, match="schema version"):
                     type(fit).from_json(json.dumps(content))
+
+
+@pytest.mark.parametrize("column", ["num_periods", "bias_real"])
+def test_a_measure_of_quality_that_is_not_a_number_is_named(tmp_path, column):
+    path = tmp_path / "levels.csv"
+    table: Any = di.load_dataset("noisy")
+    quality = {"num_periods": np.arange(table.n), "bias_real": np.linspace(0.0, 1.0, table.n)}
+    replace(table, quality=quality).save(path)
+    comment, header, first, *others = path.read_text().splitlines()
+    cells = dict(zip(header.split(","), first.split(","), strict=True)) | {column: "five"}
+    path.write_text("\n".join([comment, header, ",".join(cells.values()), *others]))
+    with pytest.raises(DataError, match=f"line 3, column '{column}': 'five' is not a number"):
+        di.read_frequency_response(path)

@@ -417,3 +417,18 @@ def test_tables_scale_with_their_units(seed, f_max, x_c):
 def test_a_record_lasts_as_long_as_its_excitation(excitation):
     measured = made(FRICTION, excitation, Acquisition(100.0))
     assert measured.time[-1] == pytest.approx(excitation.waveform(0).duration, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"plant": True}, "the model is True; expected a list of elements"),
+        ({"plant": [None]}, "the element is None; expected its kind and values by name"),
+        ({"excitation": "sine"}, "the excitation is 'sine'; expected a table of named values"),
+        ({"excitation": {"kind": []}}, r"the excitation has the kind \[\]; expected one of"),
+    ],
+)
+def test_an_experiment_of_other_values_is_refused(values, message):
+    known = Experiment(Spring(1.0), STEPS).to_dict()
+    with pytest.raises((DataError, ModelError), match=message):
+        Experiment.from_dict({**known, **values})

@@ -475,7 +475,7 @@ class _TableBinding(Binding):
         """Return columns without a role as covariates, with the types of an earlier save."""
         kinds = self.source.metadata.get("quality", {})
         covariates = {
-            name: _typed(self.source.find(name).values, kind) for name, kind in kinds.items()
+            name: self._typed(self.source.find(name), kind) for name, kind in kinds.items()
         }
         for channel in self.source.channels:
             has_role = channel.name in self.used or channel.short is not None  # of another level
@@ -487,6 +487,18 @@ class _TableBinding(Binding):
         self.used |= covariates.keys()
         return covariates
 
+    def _typed(self, channel: RawChannel, kind: str) -> NDArray[Any]:
+        """Return a column of a text file in the type it was saved from."""
+        values = channel.values
+        if kind == "b" and values.dtype.kind == "U":
+            return np.asarray(np.char.lower(values) == "true")
+        if kind in "iuf" and values.dtype.kind == "U":
+            values = self.source.from_text(channel)
+        if kind in "iu":
+            self.source.require(values % 1 == 0, channel, "a whole number")
+        types: dict[str, type] = {"b": np.bool_, "i": np.int64, "u": np.uint64, "f": np.float64}
+        return np.asarray(values, dtype=types.get(kind, np.str_))
+
 
 def _per_drive(text: str) -> tuple[str, str, int] | None:
     """Return kind of drive, unit with N instead of V or A, and power of the drive factor."""
@@ -495,11 +507,3 @@ def _per_drive(text: str) -> tuple[str, str, int] | None:
         forms += [(kind, f"({text})*{symbol}/N", -1), (kind, f"({text})*N/{symbol}", 1)]
     form = next((f for f in forms if RESPONSE_COLUMNS["gain"].accepts(f[1], "the gain")), None)
     return form if form and form[2] else None  # None for a unit of the six quantities
-
-
-def _typed(values: NDArray[Any], kind: str) -> NDArray[Any]:
-    """Return a column of a text file in the type it was saved from."""
-    if kind == "b" and values.dtype.kind == "U":
-        return np.asarray(np.char.lower(values) == "true")
-    types: dict[str, type] = {"b": np.bool_, "i": np.int64, "u": np.uint64, "f": np.float64}
-    return np.asarray(values, dtype=types.get(kind, np.str_))

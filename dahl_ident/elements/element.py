@@ -466,6 +466,8 @@ def model_from_description(description: list[Mapping[str, Any]]) -> Model:
     >>> model_from_description([{"kind": "spring", "stiffness": "free"}])
     Spring(stiffness=free)
     """
+    if not isinstance(description, Iterable):
+        raise ModelError(f"the model is {description!r}; expected a list of elements")
     return Model(*(_build(entry) for entry in description))
 
 
@@ -479,6 +481,8 @@ def _describe(element: Element) -> dict[str, Any]:
 
 
 def _build(entry: Mapping[str, Any]) -> Element:
+    if not isinstance(entry, Mapping):
+        raise ModelError(f"the element is {entry!r}; expected its kind and values by name")
     content = dict(entry)
     kind = content.pop("kind", None)
     cls = class_named(str(kind))

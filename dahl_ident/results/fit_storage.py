@@ -85,7 +85,7 @@ def from_json(text: str, source: str = "the text") -> dict[str, Any]:
 def _check(content: Any, source: str) -> None:
     """Refuse anything but an unchanged fit of this version of the layout."""
     stated = content.get("schema") if isinstance(content, Mapping) else None
-    if stated not in _BUILT:
+    if stated not in [*_BUILT]:
         expected = " or ".join(map(repr, _BUILT))
         raise DataError(f"{source} has the schema {stated!r}; expected {expected}, a saved fit")
     version = content.get("schema_version")

@@ -138,9 +138,12 @@ class Experiment:
             If a key is unknown or missing.
         """
         values = _checked(description, cls, "the experiment")
-        excitation = dict(values["excitation"])
+        excitation = values["excitation"]
+        if not isinstance(excitation, Mapping):
+            raise DataError(f"the excitation is {excitation!r}; expected a table of named values")
+        excitation = dict(excitation)
         kind = excitation.pop("kind", None)
-        if kind not in _EXCITATIONS:
+        if kind not in [*_EXCITATIONS]:
             raise DataError(
                 f"the excitation has the kind {kind!r}; expected one of {', '.join(_EXCITATIONS)}"
             )
