@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -63,13 +64,6 @@ def alternatives(problem: RecordProblem, values: FloatArray) -> Iterator[tuple[i
     for i in range(index, values.size):
         if np.isfinite(high[i] - low[i]):
             yield from ((i, 0.5 * (low[i] + high[i] + s * (high[i] - low[i]))) for s in _LOADS)
-
-
-class _Start(NamedTuple):
-    misfit: float
-    values: list[float]
-    passive: bool
-    """Whether no mass, damping, stiffness or scale is negative."""
 
 
 class _History(NamedTuple):
@@ -131,13 +125,13 @@ class _Scan:
         return _History(x[part], v[part], a[part], force[part], output[part], record.time[part])
 
     def starts(self) -> list[list[float]]:
-        """Return the free values at the best starts that differ, passive ones first."""
+        """Return the free values at the best starts that differ."""
         elements = self.problem.model.elements
         choices = [list(product(*self.grids(e))) for e in elements]
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
-        begin: list[_Start] = []
+        begin: list[tuple[float, list[float]]] = []
         columns: dict[tuple[int, int], list[FloatArray]] = {}
         for node in product(*(range(len(c)) for c in choices)):
             for e, i in enumerate(node):
@@ -149,11 +143,11 @@ class _Scan:
                 begin += self._solve(elements, shapes, sets)
         if not begin:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
-            begin = [_Start(0.0, values, passive=True)]
+            begin = [(0.0, values)]
         chosen = list[list[float]]()
-        for start in sorted(begin, key=lambda start: (not start.passive, start.misfit)):
-            if len(chosen) < _STARTS and all(_differ(start.values, other) for other in chosen):
-                chosen.append(start.values)
+        for _, values in sorted(begin, key=itemgetter(0)):
+            if len(chosen) < _STARTS and all(_differ(values, other) for other in chosen):
+                chosen.append(values)
         return chosen
 
     def grids(self, element: Element) -> list[list[float]]:
@@ -218,34 +212,27 @@ class _Scan:
         elements: tuple[Element, ...],
         shapes: list[tuple[float, ...]],
         sets: list[list[FloatArray]],
-    ) -> list[_Start]:
-        """Return starts with the best linear parameters, and the best non-negative ones."""
+    ) -> list[tuple[float, list[float]]]:
+        """Return misfit and values with the best linear parameters that are not negative.
+
+        A plant whose mass, damping and stiffness are not negative has a finite motion.
+        """
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
-        normal: FloatArray | None = None
+        normal = np.zeros((sum(scaled) + 1, sum(scaled) + 1))
         for i, history in enumerate(self.histories):
-            rows = [self._weighted(i, c[i]) for c, s in zip(sets, scaled, strict=True) if s]
+            columns = [c[i] for c, s in zip(sets, scaled, strict=True) if s]
             known = sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
-            remaining = history.force - known
-            rows.append(self._weighted(i, remaining))
-            block = np.array(rows)
-            product_ = np.real(block.conj() @ block.T)
-            normal = product_ if normal is None else normal + product_
-        if normal is None or not np.isfinite(normal).all():
+            block = np.array([self._weighted(i, f) for f in (*columns, history.force - known)])
+            normal += np.real(block.conj() @ block.T)
+        if not np.isfinite(normal).all():
             return []
         size = np.sqrt(np.maximum(normal.diagonal()[:-1], 1e-300))
         matrix = normal[:-1, :-1] / np.outer(size, size)
         right = normal[:-1, -1] / size
-        free = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
-        solutions = [free] if (free >= 0.0).all() else [free, _non_negative(matrix, right)]
-        begin = []
-        for solution in solutions:
-            values = self._values(elements, shapes, scaled, solution / size)
-            if values is not None:
-                misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
-                begin.append(_Start(float(misfit), values, passive=solution is not free))
-        if len(solutions) == 1:
-            begin = [start._replace(passive=True) for start in begin]
-        return begin
+        solution = _non_negative(matrix, right) if right.size else right
+        values = self._values(elements, shapes, scaled, solution / size)
+        misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
+        return [] if values is None else [(float(misfit), values)]
 
     @staticmethod
     def _values(
