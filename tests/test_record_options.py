@@ -188,9 +188,10 @@ def test_a_table_and_a_record_answer_the_same_questions(fit):
         assert len(one.fit_report(details=False).splitlines()) <= 15
         assert one.plot("budget") is not None
         assert one.identifiability.complete
-        assert str(one.hold_out())
         with pytest.raises(ValidationError, match="kind is 'spiral'; expected one of"):
             one.plot("spiral")
+    assert str(table.hold_out())
+    assert len(fit.hold_out().parts) == 4
 
 
 def test_fits_with_constraints_have_no_budget_and_hold_nothing_out():

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import SMALLEST, FloatArray
 from dahl_ident.elements import Element, LinearSystem
 from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import FitError, ModelError, argument
@@ -255,7 +255,7 @@ class _Scan:
                     new = float(parameter.value)
                 elif label in element.scale_parameters and parameter.dimension[0]:
                     new = value * factor
-                if parameter.lower == 0.0 and new <= 0.0:
+                if parameter.lower == 0.0 and new < SMALLEST:
                     return None
                 values.append(float(np.clip(new, parameter.lower, parameter.upper)))
         return values
