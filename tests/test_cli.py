@@ -265,6 +265,16 @@ def test_sample_integrates_at_once_where_asked(run):
     assert "--max-steps given with --method grid, which has no such option" in refused
 
 
+def test_a_saved_fit_is_sampled_with_its_model(run):
+    run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=NOISY)
+    options = ("--method", "grid", "--json")
+    saved = json.loads(run("sample", "fit.json", *options).out)
+    told = json.loads(run("sample", "-", "--alpha", "1", *options, stdin=NOISY).out)
+    assert saved["summary"] == told["summary"]
+    refused = run.refused("sample", "fit.json", "--alpha", "1")
+    assert "a saved fit has its data and model; give no options of these" in refused
+
+
 def test_a_chain_that_is_too_short_ends_with_3(run):
     outcome = run("sample", "-", "--steps", "20", "--alpha", "1", stdin=NOISY)
     assert outcome.status == 3

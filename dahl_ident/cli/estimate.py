@@ -419,7 +419,7 @@ def sample(
     report: ReportPlace = None,
     record: AsRecords = False,
 ) -> None:
-    """Sample the posterior of the parameters.
+    """Sample the posterior of the parameters, or of those of a fit saved by fit --save.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident sample - --prior f_max=0.01:1
     """
@@ -428,10 +428,15 @@ def sample(
     laws.run()
     writing.check([report], files, json=general.json)
     check_reports(report)
-    keywords = {**model.keywords(), **sampling.keywords()}
-    data = reading.read_any(files, channels, record=record)
+    data: Any
+    if len(files) == 1 and is_saved(files[0]):
+        if {*changed(reading, channels, model)} - {"metadata"} or record:
+            raise ValidationError("a saved fit has its data and model; give no options of these")
+        data, keywords = saved_fit(files[0]), {}
+    else:
+        data, keywords = reading.read_any(files, channels, record=record), model.keywords()
     try:
-        posterior = estimate_posterior(data, **keywords)
+        posterior = estimate_posterior(data, **keywords, **sampling.keywords())
     except KeyboardInterrupt:
         console.write_error(_how_to_resume(sampling.resume))
         raise
