@@ -313,10 +313,10 @@ class RecordSearch:
             hopeless = problem.output == "motion" and not first.converged[0]
             begin = part.to_values(first.theta[0])[: len(problem.free)].tolist()
             end = self.near(problem, begin, start, ROUGH if hopeless else STEPS)
-            if not end.converged[0] and unexplained(problem, end) < _DESCRIBED:
-                end = self.descend(problem, end.theta[0], STEPS)
         else:
             end = self.searched(problem, start)
+        if not end.converged[0] and unexplained(problem, end) < _DESCRIBED:
+            end = self.descend(problem, end.theta[0], STEPS)
         problem, end = self.refined(*self.freed(problem, end))
         if self.loss != "linear":
             end = self.robust(problem, end)
