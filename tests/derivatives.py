@@ -1,4 +1,4 @@
-"""Derivatives by differences, which exact derivatives are compared with."""
+"""Difference quotients, with which tests compare exact derivatives."""
 
 from __future__ import annotations
 

@@ -294,7 +294,7 @@ class _Scan:
         return np.where(_DRIVE_BAND * np.max(F**2) < F**2, X / np.maximum(F, 1e-300), 0.0)
 
 
-@np.errstate(all="ignore")  # as above
+@np.errstate(all="ignore")  # laws far off may overflow
 def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
     """Return all values of a problem from the model's free ones: with states and offsets."""
     full = np.zeros(len(problem.parameters))

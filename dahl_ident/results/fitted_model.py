@@ -338,8 +338,8 @@ class FittedModel(Result):
             One of the six standard quantities; left out, that of the data.
         noise : bool, default True
             The band holds what one more test would measure, its noise and scatter included;
-            False: the device's response itself, as always for a table predicted from records,
-            which do not tell the noise of one.
+            False: the device's response itself. Records do not show the noise of a table, so
+            tables predicted from them have this band in any case.
         initial : {"fitted", "rest"}, default "fitted"
             Whether the state at a record's first sample and its offset are fitted, the model's
             parameters held, or taken as zero.
