@@ -98,6 +98,17 @@ def test_the_force_is_predicted_although_the_model_has_a_mass(odd_columns, mappe
     assert (refused.status, "--record" in refused.err) == (1, True)
 
 
+def test_reports_and_posteriors_read_and_predict_as_fits_do(mapped, run):
+    mapped = (mapped[0], "--record", "--displacement", "x [mm]", "--force", "load [kN]",
+              "--time", "t [s]", "--mass", "free", "--predicted", "force")  # fmt: skip
+    fitted = json.loads(run("fit", *mapped, "--json").out)["params"]["sigma"]
+    run("report", *mapped, "-o", "page.json")
+    (reported,) = json.loads(Path("page.json").read_text("utf-8"))["record_fits"]
+    assert reported["parameters"]["sigma"]["value"] == pytest.approx(fitted["value"])
+    sampled = json.loads(run("sample", *mapped, "--method", "grid", "--json").out)["summary"]
+    assert sampled["sigma"]["mean"] == pytest.approx(fitted["value"], abs=fitted["stderr"])
+
+
 @pytest.mark.parametrize("words", [("--loss", "huber"), ("--method", "scipy")])
 def test_losses_and_methods_are_taken_with_records(words, mapped, run):
     base = ("fit", *mapped, "--json")

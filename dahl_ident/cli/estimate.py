@@ -22,7 +22,7 @@ from dahl_ident.cli.options import (
     steady_setting,
     with_option_groups,
 )
-from dahl_ident.cli.reading import Channels, Files, Reading
+from dahl_ident.cli.reading import Files, Reading, Records
 from dahl_ident.cli.values import prior, values
 from dahl_ident.errors import FitInterrupted, ValidationError
 
@@ -37,14 +37,6 @@ if TYPE_CHECKING:
 ReportPlace = Annotated[
     str | None,
     option("Report to write: .html, .pdf, .md or .json; - is HTML on standard output."),
-]
-AsRecords = Annotated[
-    bool,
-    option(
-        "The files are records of any motion; each is a run, or a level if each holds a sweep "
-        "at one level that no other holds. Files that plainly hold waveforms need no --record.",
-        "--record",
-    ),
 ]
 
 
@@ -132,16 +124,6 @@ def finish(result: Result) -> None:
     console.finish(result.status.usable, str(result.findings[0]))
 
 
-Predicted = Annotated[
-    str | None,
-    option(
-        "For records: force (from the motion) or motion (from the force); by default motion if "
-        "the model has a mass, else force.",
-        one_of="force|motion",
-    ),
-]
-
-
 @dataclass(frozen=True)
 class Estimating:
     """Estimation; the options of ``fit``."""
@@ -196,7 +178,7 @@ def fit(
     general: General,
     laws: Laws,
     reading: Reading,
-    channels: Channels,
+    records: Records,
     model: ModelOptions,
     estimating: Estimating,
     writing: Writing,
@@ -210,8 +192,6 @@ def fit(
     compare: Annotated[
         bool, option("Compare with other models of the friction.", "--compare")
     ] = False,
-    record: AsRecords = False,
-    predicted: Predicted = None,
 ) -> None:
     """Estimate a model's parameters, and state whether the data determine them.
 
@@ -224,7 +204,7 @@ def fit(
 
     laws.run()
     saved = len(files) > 1 and all(map(is_saved, files))
-    chosen = {*changed(reading, channels, model, estimating)} - {"metadata"}
+    chosen = {*changed(reading, records, model, estimating)} - {"metadata"}
     if saved and (chosen or save is not None):
         raise ValidationError("saved fits are compared as they are; give no other options")
     writing.check([report, save], files, json=general.json)
@@ -234,12 +214,8 @@ def fit(
         return
     if save is not None:
         place_of(save, "a fit", FORMATS)
-    data = reading.read_any(files, channels, record=record)
-    if predicted is not None and not isinstance(data, list):
-        raise ValidationError(
-            "--predicted is given for a table, which has no motion in time; leave it out"
-        )
-    result = fitted(data, model, estimating, predicted)
+    data = reading.read_any(files, records)
+    result = fitted(data, model, estimating, records.predicted)
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
     if general.json:
@@ -287,6 +263,7 @@ def report(
     general: General,
     laws: Laws,
     reading: Reading,
+    records: Records,
     model: ModelOptions,
     estimating: Estimating,
     writing: Writing,
@@ -326,7 +303,7 @@ def report(
             "--waveforms-columns is given without --waveforms; give both, or neither"
         )
     saved = all(map(is_saved, files))
-    chosen = {*changed(reading, model, estimating)} - {"metadata"}
+    chosen = {*changed(reading, records, model, estimating)} - {"metadata"}
     if (saved and chosen) or (not saved and any(map(is_saved, files))):
         raise ValidationError(
             "saved fits are reported unchanged: give no tables together with them, and no options "
@@ -338,7 +315,7 @@ def report(
     fits: Sequence[FitResult] = (
         [saved_fit(file) for file in files]
         if saved
-        else [fitted(reading.read_any(files), model, estimating)]
+        else [fitted(reading.read_any(files, records), model, estimating, records.predicted)]
     )
     results: list[Reported] = [*fits]
     for fit in fits if bootstrap else ():
@@ -412,12 +389,11 @@ def sample(
     general: General,
     laws: Laws,
     reading: Reading,
-    channels: Channels,
+    records: Records,
     model: ModelOptions,
     sampling: Sampling,
     writing: Writing,
     report: ReportPlace = None,
-    record: AsRecords = False,
 ) -> None:
     """Sample the posterior of the parameters, or of those of a fit saved by fit --save.
 
@@ -430,11 +406,13 @@ def sample(
     check_reports(report)
     data: Any
     if len(files) == 1 and is_saved(files[0]):
-        if {*changed(reading, channels, model)} - {"metadata"} or record:
+        if {*changed(reading, records, model)} - {"metadata"}:
             raise ValidationError("a saved fit has its data and model; give no options of these")
         data, keywords = saved_fit(files[0]), {}
     else:
-        data, keywords = reading.read_any(files, channels, record=record), model.keywords()
+        data, keywords = reading.read_any(files, records), model.keywords()
+        if records.predicted is not None:
+            data, keywords = fitted(data, model, Estimating(), records.predicted), {}
     try:
         posterior = estimate_posterior(data, **keywords, **sampling.keywords())
     except KeyboardInterrupt:

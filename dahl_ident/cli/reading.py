@@ -6,7 +6,7 @@ import ast
 import glob
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -74,12 +74,29 @@ class Channels:
         "Treatment of empty samples: error or drop.", "error", one_of="error|drop"
     )
 
+
+@dataclass(frozen=True)
+class Records(Channels):
+    """Records in place of tables: that they are records, how they are read, what is predicted."""
+
+    record: bool = setting(
+        "The files are records of any motion; each is a run, or a level if each holds a sweep "
+        "at one level that no other holds. Files that plainly hold waveforms need no --record.",
+        False,
+        "--record",
+    )
+    predicted: str | None = setting(
+        "For records: force (from the motion) or motion (from the force); by default motion if "
+        "the model has a mass, else force.",
+        one_of="force|motion",
+    )
+
     def refuse_for_tables(self) -> None:
         """Refuse these options if the files are tables."""
         refuse(
             changed(self),
-            "without --record; leave it out, or name the columns of a table in a column map "
-            "(--columns)",
+            "without --record; leave it out (a column map, --columns, names the columns of a "
+            "table)",
         )
 
 
@@ -134,7 +151,7 @@ class Reading(_Common):
                 data = _with_labels(data, column, [label.strip() for label in labels.split(",")])
         return data if where is None else data.select(rows=_rows_where(data, where))
 
-    def read_records(self, files: list[str], channels: Channels) -> list[Record]:
+    def read_records(self, files: list[str], records: Records) -> list[Record]:
         """Read each file as a record; options that only tables have are refused."""
         from dahl_ident.data import read_record
 
@@ -145,29 +162,27 @@ class Reading(_Common):
             "and the names of channels, such as --displacement (dahl-ident inspect proposes a "
             "column map)",
         )
-        keywords = vars(channels) | {name: getattr(self, name) for name in _RECORD_OPTIONS}
+        keywords = {channel.name: getattr(records, channel.name) for channel in fields(Channels)}
+        keywords |= {name: getattr(self, name) for name in _RECORD_OPTIONS}
         return [read_record(file, **keywords) for file in files]
 
-    def read_any(
-        self, files: list[str], channels: Channels | None = None, *, record: bool = False
-    ) -> FrequencyResponse | list[Record]:
-        """Read a table, or records if `record` is set or the files contain waveforms."""
+    def read_any(self, files: list[str], records: Records) -> FrequencyResponse | list[Record]:
+        """Read a table, or records if --record is given or the files contain waveforms."""
         from dahl_ident.data.response_table import WaveformsError
 
-        channels = channels or Channels()
-        if record:
-            return self.read_records(files, channels)
+        if records.record:
+            return self.read_records(files, records)
         try:
             data = self.read(files)
         except WaveformsError:
             if STANDARD in files:  # which cannot be read a second time
                 raise
             console.note("the files hold waveforms: fitted sample by sample, as with --record")
-            return self.read_records(files, channels)
+            return self.read_records(files, records)
         except DataError:
-            channels.refuse_for_tables()
+            records.refuse_for_tables()
             raise
-        channels.refuse_for_tables()
+        records.refuse_for_tables()
         return data
 
 
