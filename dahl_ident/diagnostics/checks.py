@@ -326,12 +326,13 @@ def robust_values(at: Optimum) -> FloatArray:
 
 @_of_records
 def _delay(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield the delay that was removed; it is doubtful if its effect exceeds the residuals."""
+    """Yield the removed delay; one that exceeds the residuals is doubtful, unless it was stated."""
     problem = fit.problem
     if not problem.delay:
         return
     moved = problem.delay * np.concatenate(problem.delay_slopes(fit.optimum.values))
-    doubtful = bool(np.sqrt(np.mean(moved**2)) > fit.goodness.rms)
+    exceeds = bool(np.sqrt(np.mean(moved**2)) > fit.goodness.rms)
+    doubtful = exceeds and "delay" not in problem.calibration
     samples = problem.delay * problem.records[0].sample_rate
     lag = {"delay": problem.delay, "samples": samples, "doubtful": doubtful}
     yield described("delay", _APPROXIMATE if doubtful else _TRUSTED, **lag)

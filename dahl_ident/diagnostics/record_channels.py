@@ -54,9 +54,8 @@ def motion_sources(
     outputs by `other_motions`.
     """
     problem = fit.problem
-    if "delay" not in problem.calibration:
-        with suppress(FitError):  # no motion next to the estimate
-            yield from _if_it_matters(fit, DELAY, by_delay(fit))
+    with suppress(FitError):  # no motion next to the estimate
+        yield from _if_it_matters(fit, DELAY, by_delay(fit))
     if problem.output != "force":
         return
     moved = np.zeros(fit.inverse.shape)
@@ -128,21 +127,15 @@ def _squared(change: FloatArray) -> FloatArray:
 
 
 def by_calibration(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
-    """Yield what stated calibrations contribute.
+    """Yield what stated calibrations of the gains contribute.
 
     A gain changes the units of force or of displacement, and every parameter with them, if all are
-    estimated; known ones stay, which changes the others as if the known ones were wrong. A delay
-    shifts the output in time.
+    estimated; known ones stay, which changes the others as if the known ones were wrong.
     """
     problem = fit.problem
-    for name, u in problem.calibration.items():
-        if name == "delay":
-            times = [record.time for record in problem.records]
-            pairs = zip(fit.outputs, times, strict=True)
-            change = fit.changed([np.gradient(y, t) for y, t in pairs])
-        else:
-            change = _by_gain(fit, list(CHANNELS).index(name))
-        yield CHANNELS[name], _squared(u * change)
+    for place, name in enumerate(("force_gain", "displacement_gain")):
+        if u := problem.calibration.get(name):
+            yield CHANNELS[name], _squared(u * _by_gain(fit, place))
     stated = [r.drive_factor_uncertainty for r in problem.records]
     factor = max((float(u) for u in stated), default=0.0)
     if factor > 0.0 and (problem.output == "force" or problem.excitation == "force"):

@@ -27,7 +27,7 @@ from dahl_ident.arrays import BoolArray, FloatArray, IntArray, unit_diagonal
 from dahl_ident.diagnostics.contributions import excess, positive_part
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.errors import FitError
-from dahl_ident.fitting.record_search import STEPS, RecordSearch
+from dahl_ident.fitting.record_search import STEPS, RecordSearch, noise_power
 from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -203,7 +203,7 @@ def fixed_exponents(
         low, high = min(low, 0.0), max(high, 0.0)
         ratio, ratio_std = freed.change, float(freed.covariance[-1, -1]) ** 0.5
         mean, s = float(np.clip(ratio, low, high)), (high - low) / 12**0.5
-        std, covariance = freed.with_prior(mean, s, exact)
+        std, covariance = freed.with_prior(mean, freed.widened(mean, s), exact)
         if not p.assumed or abs(ratio) > max(_LINEAR, _CONTRADICTED * ratio_std):
             with suppress(FitError):  # the motion cannot be computed at values that are tried
                 ratio, ratio_std = _searched_ratio(fit, p.name, sources) or (ratio, ratio_std)
@@ -228,7 +228,9 @@ def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float,
     """Return ln of an exponent's estimate over its value, and its standard deviation, by a search.
 
     None if the fixed exponent describes the records better. The noise of the displacement is
-    estimated again, because its estimate with the exponent fixed may contain misfit.
+    estimated again, because its estimate with the exponent fixed may contain misfit. Far from the
+    value the model is not linear: the distance has at most as many standard deviations as the fall
+    of the cost shows.
     """
     problem = fit.problem
     search, free = RecordSearch("lm", "linear"), problem.freed([name])
@@ -245,19 +247,22 @@ def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float,
     predicted = [free.predict(values, number) for number in range(len(problem.records))]
     e = [y - p.output for y, p in zip(free.measured, predicted, strict=True)]
     at_end = LinearFit.of(free, values, [p.by for p in predicted], e)
-    u = float(at_end.covariance(sources)[i, i]) ** 0.5
-    return float(np.log(values[i] / value)), u / float(values[i])
+    u = float(at_end.covariance(sources)[i, i]) ** 0.5 / float(values[i])
+    ratio, fall = float(np.log(values[i] / value)), cost - float(end.cost[0])
+    deviance = 2.0 * fall / noise_power(float(end.cost[0]), free.n_residuals, e)
+    return ratio, max(u, abs(ratio) / deviance**0.5)
 
 
 def by_delay(fit: LinearFit) -> FloatArray:
-    """Return the covariance of the estimate due to the delay, which the user did not state.
+    """Return the covariance of the estimate due to the delay.
 
     The estimated delay has been removed, unless it is too long for that. The prior of the rest has
-    a standard deviation of one sample; its weight is less if the records contain more information.
+    the problem's `delay_std`, which is widened unless the user stated it.
     """
-    sample = 1.0 / fit.problem.records[0].sample_rate
-    freed = _FreedValue.of(fit, [sample * slope for slope in fit.delay_slopes])
-    return freed.with_prior(freed.change, 1.0, fit.covariance())[1]
+    unit, stated = fit.problem.delay_std, "delay" in fit.problem.calibration
+    freed = _FreedValue.of(fit, [unit * slope for slope in fit.delay_slopes])
+    s = 1.0 if stated else freed.widened(freed.change, 1.0)
+    return freed.with_prior(freed.change, s, fit.covariance())[1]
 
 
 class _FreedValue(NamedTuple):
@@ -277,19 +282,27 @@ class _FreedValue(NamedTuple):
         change = float(joint.projected(joint.residuals)[-1])
         return cls(change, joint.covariance(sources), others)
 
+    def widened(self, mean: float, s: float) -> float:
+        """Return the standard deviation `s` of an assumed prior, with less weight than the records.
+
+        It is wider if the estimate from the records, `mean`, contradicts the prior.
+        """
+        u2 = float(self.covariance[-1, -1])
+        if not np.isfinite(u2):
+            return s
+        contradiction = max(mean**2 - _CONTRADICTED**2 * u2, 0.0) ** 0.5
+        return float(max(s, s**2 / max(u2, 1e-300) ** 0.5, contradiction))
+
     def with_prior(self, mean: float, s: float, exact: FloatArray) -> tuple[float, FloatArray]:
         """Return the standard deviation of the value, and what it adds to the others' covariance.
 
-        `mean` is the estimate from the records, `s` the standard deviation of the prior, which is
-        widened if the records contradict it, and `exact` the covariance of the other values if
-        this one is exact.
+        `mean` is the estimate from the records, `s` the standard deviation of the prior, and
+        `exact` the covariance of the other values if this one is exact.
         """
         u2, C = float(self.covariance[-1, -1]), self.covariance
         line = np.outer(self.others, self.others)
         if not np.isfinite(u2):
             return s, s**2 * line
-        contradiction = max(mean**2 - _CONTRADICTED**2 * u2, 0.0) ** 0.5
-        s = max(s, s**2 / max(u2, 1e-300) ** 0.5, contradiction)
         weight = s**2 / (s**2 + u2)
         shrink = np.column_stack([np.eye(self.others.size), (weight - 1.0) * self.others])
         total = shrink @ np.where(np.isfinite(C), C, 0.0) @ shrink.T

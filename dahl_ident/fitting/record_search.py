@@ -34,7 +34,7 @@ _DESCRIBED = 0.1  # unexplained share of variance that shows a wrong model, not 
 _REWEIGHTINGS = 12  # most iterations of the weights
 _BANDS = 0.0, 1.0, 2.0, 4.0  # dead bands tried, in units of the noise that differences show
 _ALIGNED = 0.02  # part of the sum of squares that a delay has to explain to be removed
-_LONGEST_DELAY = 2.0  # samples: twice the assumed standard deviation
+_LONGEST_DELAY = 2.0  # times its standard deviation
 _ALIGNMENTS = 4  # most steps of the delay: each is a hundredth of the one before
 SLOW = 0.5  # correlation of neighbouring residuals above which they are weighted by their spectrum
 EXACT = 1e-12  # unexplained share of variance that is rounding
@@ -200,13 +200,13 @@ class RecordSearch:
         Steps of the delay are taken, with all values free, as long as each explains more than
         chance. A delay is not removed, but counted as an uncertainty only, if it explains little or
         the remaining residuals are not noise, because it may be due to a misfit; also if it is
-        longer than that between channels sampled together, such as the effect of a missing damper.
-        A delay that the user stated is not changed.
+        longer than stated, or than that between channels sampled together, such as the effect of a
+        missing damper.
         """
         is_exact = unexplained(problem, plain) < EXACT
-        if not plain.converged[0] or "delay" in problem.calibration or is_exact:
+        if not plain.converged[0] or is_exact:
             return problem, plain
-        sample, delayed, end = 1.0 / problem.records[0].sample_rate, problem, plain
+        delayed, end = problem, plain
         for _ in range(_ALIGNMENTS):
             step, fall = self._delay_step(delayed, end.theta[0])
             residuals = delayed.split_residuals(delayed.to_values(end.theta[0]))
@@ -214,7 +214,7 @@ class RecordSearch:
             part = 0.0 if delayed.delay else _ALIGNED * 2.0 * float(end.cost[0])
             if not fall > max(chance, part):
                 break
-            if abs(delayed.delay + step) > _LONGEST_DELAY * sample:
+            if abs(delayed.delay + step) > _LONGEST_DELAY * problem.delay_std:
                 return problem, plain
             delayed = delayed.delayed(delayed.delay + step)
             end = self.descend(delayed, end.theta[0], STEPS)

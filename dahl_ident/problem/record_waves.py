@@ -187,6 +187,11 @@ class RecordWaves(Problem):
         return self.calibration
 
     @property
+    def delay_std(self) -> float:
+        """Standard deviation of the delay, s: as stated, or one sample."""
+        return self.calibration.get("delay", 1.0 / self.records[0].sample_rate)
+
+    @property
     def all_parameters(self) -> tuple[Parameter, ...]:
         """The model's parameters, fixed ones included, and what each record adds."""
         return (*self.model.parameters, *self.parameters[self.n_reported :])
