@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from difflib import get_close_matches
+from types import MappingProxyType
 from typing import Any
 
 __all__ = [
@@ -274,37 +275,40 @@ def choices(known: Iterable[str], *words: object) -> str:
     return ", ".join(names) + (f"; did you mean {', '.join(near)}?" if near else "")
 
 
-_OPTIONS: ContextVar[bool] = ContextVar("options", default=False)
+_FIELDS: ContextVar[Mapping[str, str] | None] = ContextVar("fields", default=None)
+"""None in Python; otherwise the labels of those options that a form has as fields."""
 
 
 @contextmanager
-def arguments_as_options() -> Iterator[None]:
-    """Name arguments in messages as options of the command line."""
-    before = _OPTIONS.set(True)
+def arguments_as_options(fields: Mapping[str, str] = MappingProxyType({})) -> Iterator[None]:
+    """Name arguments in messages as options of the command line, or as `fields` of a form."""
+    before = _FIELDS.set(fields)
     try:
         yield
     finally:
-        _OPTIONS.reset(before)
+        _FIELDS.reset(before)
 
 
 def names_options() -> bool:
-    """Return whether messages name command-line options instead of arguments."""
-    return _OPTIONS.get()
+    """Return whether messages name options or fields instead of arguments."""
+    return _FIELDS.get() is not None
 
 
 def name_options(on: bool) -> None:
     """Set whether messages name options, in a process that works for another one."""
-    _OPTIONS.set(on)
+    _FIELDS.set({} if on else None)
 
 
-def spelled(python: str, options: str) -> str:
-    """Return the text for Python, or that for the command line if it is in use.
+def spelled(python: str, options: str, form: str | None = None) -> str:
+    """Return the text for Python, or that for the command line or a form if it is in use.
 
     Examples
     --------
     >>> spelled("fit(record, model)", "dahl-ident fit --record")
     'fit(record, model)'
     """
+    if form is not None and _FIELDS.get():
+        return form
     return options if names_options() else python
 
 
@@ -321,7 +325,7 @@ LOW, HIGH, ANY = Placeholder("low"), Placeholder("high"), Placeholder("...")
 
 
 def argument(name: str, value: Any = None, *, option: str | None = None) -> str:
-    """Return an argument for a message, ``name=value`` or ``--name value``.
+    """Return an argument for a message: ``name=value``, ``--name value`` or ``"Field" value``.
 
     A mapping becomes one option for each name; `option` is the option's name if it differs.
 
@@ -332,8 +336,12 @@ def argument(name: str, value: Any = None, *, option: str | None = None) -> str:
     >>> with arguments_as_options():
     ...     argument("frequency"), argument("ranges", {"mass": (LOW, HIGH)})
     ('--frequency', '--ranges mass=low:high')
+    >>> with arguments_as_options({"frequency": "Frequency of all rows"}):
+    ...     argument("frequency", 5)
+    '"Frequency of all rows" 5'
     """
-    typed = f"--{(option or name).replace('_', '-')}"
+    fields = _FIELDS.get() or {}
+    typed = f'"{fields[name]}"' if name in fields else f"--{(option or name).replace('_', '-')}"
     if isinstance(value, Mapping):
         return spelled(
             f"{name}={dict(value)!r}",

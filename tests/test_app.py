@@ -126,6 +126,16 @@ def test_a_bad_file_is_refused_in_the_reader_s_words(server):
     assert 'value="model" disabled' in page
 
 
+def test_an_error_names_the_fields_of_the_form(server):
+    page = unescape(
+        server.page(server.upload([("a.csv", b"frequency_hz,gain [m/N],phase_deg\n1,2,3\n")]))
+    )
+    alert = page.partition('role="alert"')[2].partition("</div>")[0]
+    assert 'Name a column with the meaning "amplitude", or give "Force amplitude' in alert
+    assert "or \"Displacement amplitude\" '5 um' for the whole file" in alert
+    assert '<label for="amplitude">Displacement amplitude</label>' in page
+
+
 def test_channels_are_read_as_the_page_proposes(server):
     rows = "\n".join(f"{0.01 * i},{math.sin(0.1 * i)},{math.cos(0.1 * i)}" for i in range(400))
     waves = f"time [s],LVDT [um],load cell [N]\n{rows}"

@@ -48,6 +48,20 @@ LINEAR = {"mass": Mass, "damping": Damper, "stiffness": Spring}
 TABLE_OPTIONS = ("quantity", "amplitude", "frequency", "sweep", "level_from_name", "controlled")
 RECORD_OPTIONS = ("sample_rate",)
 COMMON_OPTIONS = ("drive", "drive_factor")
+FIELDS = {
+    "columns": "What the channels are",
+    "kind": "They hold",
+    "controlled": "Held by the bench",
+    "quantity": "Response quantity",
+    "frequency": "Frequency of all rows",
+    "sweep": "Frequencies in order",
+    "amplitude": "Displacement amplitude",
+    "drive": "Force amplitude, or its column",
+    "drive_factor": "Force for one unit of drive",
+    "level_from_name": "Level in the files' names (regular expression)",
+    "sample_rate": "Sample rate",
+}
+"""What the form of the data calls the options of reading, on the page and in messages."""
 ROLES = (
     "",
     "time",

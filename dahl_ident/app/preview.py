@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.app.commands import COMMON_OPTIONS, TABLE_OPTIONS
+from dahl_ident.app.commands import COMMON_OPTIONS, FIELDS, TABLE_OPTIONS
 from dahl_ident.data import read_frequency_response, read_record
 from dahl_ident.data.readers import open_source
 from dahl_ident.data.readers.inspection import contents
 from dahl_ident.data.response_table import WaveformsError
-from dahl_ident.errors import DahlIdentError
+from dahl_ident.errors import DahlIdentError, arguments_as_options
 from dahl_ident.reporting.document import Picture
 from dahl_ident.units import parse_quantity
 
@@ -45,7 +45,7 @@ def preview(state: dict[str, Any]) -> dict[str, Any]:
     """Return the channels of the first file, a summary of all data, and errors and warnings."""
     result: dict[str, Any] = {**EMPTY_PREVIEW, "channels": [], "notes": []}
     files = [str(file["stored"]) for file in state["files"]]
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught, arguments_as_options(FIELDS):
         warnings.simplefilter("always")
         try:
             columns = _add_channels(files[0], result)

@@ -212,7 +212,14 @@ class App:
         """Show the channels of the files, and the form that says what each one is."""
         work = self._work(request)
         preview = await run_in_threadpool(self._preview, work)
-        return self._page("data", work=work, state=work.state, found=preview, roles=commands.ROLES)
+        return self._page(
+            "data",
+            work=work,
+            state=work.state,
+            found=preview,
+            roles=commands.ROLES,
+            fields=commands.FIELDS,
+        )
 
     def _preview(self, work: Work) -> dict[str, Any]:
         child = subprocess.run(

@@ -25,6 +25,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -94,8 +95,25 @@ def column_map_of(entries: Mapping[str, Any]) -> str:
 
     lines = "; ".join(f"{role} = {toml(entry)}" for role, entry in entries.items())
     return spelled(
-        f"columns={dict(entries)!r}", f"--columns columns.toml, a file with the line: {lines}"
+        f"columns={dict(entries)!r}",
+        f"--columns columns.toml, a file with the line: {lines}",
+        " and ".join(starmap(_meaning, entries.items())),
     )
+
+
+def _meaning(role: str, entry: Any) -> str:
+    """Return, for messages, what to choose for a column in a form."""
+    name, unit = entry, None
+    if isinstance(entry, Mapping):
+        name, unit = entry["column"], entry["unit"]
+    of = "" if name is ANY else f" of {name}"
+    return f'the meaning "{role}"{of}' + (f" and its unit, {unit}" if unit else "")
+
+
+def proposal() -> str:
+    """Return, for messages, how the user gets a column map; a form shows one."""
+    hint = " (inspect proposes a column map)"
+    return spelled(hint, hint, "")
 
 
 def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
@@ -202,7 +220,7 @@ class Binding:
             return column_map_of({role: entry})
         typed = f"{entry['column']} [{entry['unit']}]" if isinstance(entry, Mapping) else entry
         columns = {role: entry}
-        return spelled(f"{columns=}", argument(role, typed))
+        return spelled(f"{columns=}", argument(role, typed), _meaning(role, entry))
 
     def mapped(self, role: str) -> MappedColumn:
         """Return the entry of a role in the column map."""
@@ -256,7 +274,7 @@ class Binding:
             raise DataError(
                 f"{self.source.name}: no column holds the {role}; there are "
                 f"{listed([c.header for c in self.source.channels], 20)}. Name it with "
-                f"{self.naming(role)} (inspect proposes a column map)"
+                f"{self.naming(role)}{proposal()}"
             )
         return channel
 
@@ -276,8 +294,12 @@ class Binding:
             return None
         values, unit = self.numbers(role, channel), self.unit(role, channel)
         if declared.expected and least:
-            keep = spelled("frequency_hz=(low, high)", "--where 'low <= frequency_hz <= high'")
-            hint = f"; {keep} keeps a range" if role == "frequency" else ""
+            keep = spelled(
+                "; frequency_hz=(low, high) keeps a range",
+                "; --where 'low <= frequency_hz <= high' keeps a range",
+                "",
+            )
+            hint = keep if role == "frequency" else ""
             self.source.require(values >= declared.least, channel, declared.expected + hint)
         if declared.kinds:
             _, factor = self.kind(role, unit)

@@ -8,13 +8,13 @@ from typing import Any, Literal
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.column_map import Binding, ColumnMap, scaled
+from dahl_ident.data.column_map import Binding, ColumnMap, proposal, scaled
 from dahl_ident.data.columns import RECORD_COLUMNS
 from dahl_ident.data.plausibility import record_warnings
 from dahl_ident.data.raw_columns import RawChannel, RawFile, missing_marks
 from dahl_ident.data.record import Record, is_even
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, UnitError, ValidationError, argument
+from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import MOTION_KINDS, counted, si_unit
 
 _STAMP = re.compile(
@@ -101,8 +101,8 @@ def _channels(bound: Binding) -> dict[str, RawChannel]:
         raise DataError(
             f"{source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
             f"displacement, velocity and acceleration. Name it, such as "
-            f"{argument('displacement', 'x')}; there are "
-            f"{listed([c.header for c in source.channels], 20)} (inspect proposes a column map)"
+            f"{bound.naming('displacement', 'x')}; there are "
+            f"{listed([c.header for c in source.channels], 20)}{proposal()}"
         )
     channels = {motions[0]: bound.required(motions[0])}
     if bound.map.sample_rate is None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_number
-from dahl_ident.data.column_map import Binding, ColumnMap, by_level, column_map_of
+from dahl_ident.data.column_map import Binding, ColumnMap, by_level, column_map_of, proposal
 from dahl_ident.data.columns import CONTROLLED, RECORD_COLUMNS, RESPONSE_COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.plausibility import (
@@ -174,8 +174,8 @@ class _TableBinding(Binding):
         if amplitude is None and drive is None:
             raise ValidationError(
                 "neither an amplitude nor a drive is given; friction answers every amplitude "
-                f"differently. Name a column with {column_map_of({'amplitude': ANY})} (inspect "
-                f"proposes a column map), or give {argument('drive', '0.2 N')} or "
+                f"differently. Name a column with {column_map_of({'amplitude': ANY})}"
+                f"{proposal()}, or give {argument('drive', '0.2 N')} or "
                 f"{argument('amplitude', '5 um')} for the whole file"
             )
         harmonic: Any = 1
@@ -239,7 +239,7 @@ class _TableBinding(Binding):
             in_hertz = any(RESPONSE_COLUMNS["frequency"].accepts(c.unit, c.name) for c in channels)
             if hertz is None and rows and (in_hertz or not self.has("amplitude")):
                 raise ValidationError(
-                    "no column holds the frequency (inspect proposes a column map); name it with "
+                    f"no column holds the frequency{proposal()}; name it with "
                     f"{column_map_of({'frequency': ANY})}, or say what was swept, such as "
                     f"{argument('sweep', '1:100Hz log')}, or give {argument('frequency', 5)}"
                 )
@@ -281,7 +281,11 @@ class _TableBinding(Binding):
                 f"{self.source.name}: it holds waveforms ({listed([c.header for c in channels], 5)}"
                 "), and a table of responses at some frequencies was expected. If they are sine "
                 "tests, make such a table with extract; any other motion is fitted as a record: "
-                f"{spelled('di.fit(di.read_record(file), model)', 'dahl-ident fit --record')}"
+                + spelled(
+                    "di.fit(di.read_record(file), model)",
+                    "dahl-ident fit --record",
+                    argument("kind", "waveforms"),
+                )
             )
 
     def _backbone(
@@ -349,8 +353,8 @@ class _TableBinding(Binding):
             headers = listed([channel.header for channel in self.source.channels], 20)
             raise ValidationError(
                 "no response; expected real and imag, gain (or gain_db) and phase, complex "
-                f"numbers, or a phase together with amplitude and drive; there are {headers} "
-                "(inspect proposes a column map)"
+                f"numbers, or a phase together with amplitude and drive; there are {headers}"
+                f"{proposal()}"
             )
         if self.map.quantity is None:
             raise ValidationError(
