@@ -10,8 +10,10 @@ from html import unescape
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
+from scipy.io import savemat
 
 import dahl_ident as di
 from tests.app_server import started
@@ -143,6 +145,27 @@ def test_channels_are_read_as_the_page_proposes(server):
     for text, found in ((waves, "waveforms"), (table, "a table of responses")):
         page = server.page(server.upload([("own.csv", text.encode())]))
         assert f"Read as {found}" in page
+
+
+def test_a_struct_array_is_one_channel_for_each_name(server, tmp_path):
+    levels = np.zeros((1, 2), [(name, object) for name in ("frequency", "drive", "gain", "phase")])
+    for u, level in enumerate(levels.flat, 1):
+        rows = np.arange(1.0, 8.0)
+        level["frequency"], level["drive"] = rows, np.full(7, 0.1 * u)
+        level["gain"], level["phase"] = 1e-3 / rows, -10.0 * rows
+    savemat(tmp_path / "levels.mat", {"FR": levels})
+    place = server.upload([("levels.mat", (tmp_path / "levels.mat").read_bytes())])
+    units = {"frequency": "Hz", "drive": "N", "gain": "m/N", "phase": "deg"}
+    form: dict[str, str] = {}
+    for n, (name, unit) in enumerate(units.items(), 1):
+        form |= {f"channel_{n}": f"FR[*].{name}", f"role_{n}": name, f"unit_{n}": unit}
+    server.send(place, **form)
+    page = unescape(server.page(place))
+    for n, name in enumerate(units, 1):
+        assert f'name="channel_{n}" value="FR[*].{name}"' in page
+        assert f'<option value="{name}" selected>' in page
+    assert "channel_5" not in page
+    assert "FrequencyResponse: 14 points of receptance" in page
 
 
 def test_two_channels_with_one_role_are_named(server):

@@ -262,6 +262,17 @@ class TestMatlab:
         assert re.findall(r'column = "(\w+)"', proposed) == ["time", "x", "F"]
         assert "even, 64 samples" in inspect(tmp_path / "a.mat").sampling
 
+    def test_the_map_proposed_for_an_array_of_records_reads_the_first(self, tmp_path):
+        runs = np.zeros((1, 2), [(name, object) for name in ("time", "x", "F")])
+        for factor, run in zip((1.0, 2.0), runs.flat, strict=True):
+            run["time"], run["x"], run["F"] = TIME, factor * X, factor * F
+        savemat(tmp_path / "runs.mat", {"run": runs})
+        text = inspect(tmp_path / "runs.mat").column_map
+        for unit in ("s", "m", "N"):
+            text = text.replace('unit = ""', f'unit = "{unit}"', 1)
+        (tmp_path / "columns.toml").write_text(text)
+        assert_the_run(read_record(tmp_path / "runs.mat", columns=tmp_path / "columns.toml"))
+
     def test_no_such_path(self, matlab):
         with pytest.raises(DataError, match=r"no column is called 'rig.run.q'; there are .*rig"):
             read_record(matlab, time="rig.run.q", displacement="rig.run.x", force="rig.run.F")

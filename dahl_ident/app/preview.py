@@ -11,7 +11,7 @@ import sys
 import tomllib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import numpy as np
 from dahl_ident.app.commands import COMMON_OPTIONS, FIELDS, TABLE_OPTIONS
 from dahl_ident.data import read_frequency_response, read_record
 from dahl_ident.data.readers import open_source
-from dahl_ident.data.readers.inspection import contents
+from dahl_ident.data.readers.inspection import contents, patterns, summary
 from dahl_ident.data.response_table import WaveformsError
 from dahl_ident.errors import DahlIdentError, arguments_as_options
 from dahl_ident.reporting.document import Picture
@@ -57,23 +57,29 @@ def preview(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def _add_channels(file: str, result: dict[str, Any]) -> dict[str, Any]:
-    """Add the channels of a file, and return its column map, which is proposed at first."""
+    """Add the channels of a file, and return its column map, which is proposed at first.
+
+    Those of one name in struct arrays are one channel, as in a column map.
+    """
     source = open_source(file)
-    summary = contents(source)
+    found = contents(source)
     path = Path("columns.toml")
-    text = path.read_text("utf-8") if path.exists() else summary.column_map
+    text = path.read_text("utf-8") if path.exists() else found.column_map
     roles: dict[str, Any] = tomllib.loads(text)
     by_column = {
         entry["column"]: (role, entry) for role, entry in roles.items() if isinstance(entry, dict)
     }
-    result["format"], result["sampling"] = summary.format, summary.sampling
-    result["notes"] += [*summary.gaps, *summary.notes]
-    for channel, line in zip(source.channels, summary.channels, strict=True):
-        role, entry = by_column.get(channel.name, ("", {}))
+    result["format"], result["sampling"] = found.format, found.sampling
+    result["notes"] += [*found.gaps, *found.notes]
+    for name, (channel, *others) in patterns(source).items():
+        if others:
+            values = np.concatenate([np.atleast_1d(c.values) for c in (channel, *others)])
+            channel = replace(channel, name=name, content=values)
+        role, entry = by_column.get(name, ("", {}))
         curve = _thumbnail(channel.values) if channel.kind in "fiu" else []
         result["channels"].append(
             {
-                **asdict(line),
+                **asdict(summary(channel)),
                 "role": role,
                 "curve": curve,
                 "sign": entry.get("sign", 1),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import indent
 
@@ -83,7 +83,7 @@ def contents(source: RawFile) -> FileContents:
     return FileContents(
         source.name,
         source.format,
-        tuple(_summary(c) for c in source.channels),
+        tuple(summary(c) for c in source.channels),
         sampling,
         missing,
         _proposal(source),
@@ -91,7 +91,8 @@ def contents(source: RawFile) -> FileContents:
     )
 
 
-def _summary(channel: RawChannel) -> ChannelSummary:
+def summary(channel: RawChannel) -> ChannelSummary:
+    """Summarise a channel."""
     values = np.atleast_1d(channel.values)
     if values.dtype.kind in "fiu":
         finite = values[np.isfinite(values)]
@@ -139,9 +140,7 @@ def _sampling(source: RawFile) -> tuple[str, tuple[str, ...]]:
 
 def _proposal(source: RawFile) -> str:
     """Return a column map in TOML: roles by name, otherwise by unit."""
-    groups = _patterns(source)
-    if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
-        groups = {path: channel for path, channel in groups.items() if channel.size > 1}
+    groups = _vectors(patterns(source))
     response = _is_response(groups.values())
     every = RESPONSE_COLUMNS | _SHORT if response else RECORD_COLUMNS
     proposed = _RESPONSE | _SHORT if response else _RECORD
@@ -221,17 +220,27 @@ def _entry(role: str, path: str, channel: RawChannel) -> Iterator[str]:
         yield f"unit = {json.dumps(unit, ensure_ascii=False)}"
 
 
-def _patterns(source: RawFile) -> dict[str, RawChannel]:
-    """Return channels by path; those of the same name in struct arrays by one path with ``*``."""
+def patterns(source: RawFile) -> dict[str, list[RawChannel]]:
+    """Return channels by path; those of one name in struct arrays of tables by a path with ``*``.
+
+    A record is read from one element, whose path has no ``*``.
+    """
     by_short: dict[str, list[RawChannel]] = {}
     for channel in source.channels:
         by_short.setdefault(channel.short or channel.name, []).append(channel)
-    out: dict[str, RawChannel] = {}
+    out: dict[str, list[RawChannel]] = {}
     for channels in by_short.values():
         parts = [re.split(r"([.\[\]/])", c.name) for c in channels]
         if len(channels) > 1 and len({len(p) for p in parts}) == 1:
             columns = zip(*parts, strict=True)
-            out["".join(c[0] if len(set(c)) == 1 else "*" for c in columns)] = channels[0]
+            out["".join(c[0] if len(set(c)) == 1 else "*" for c in columns)] = channels
         else:
-            out |= {c.name: c for c in channels}
-    return out
+            out |= {c.name: [c] for c in channels}
+    is_response = _is_response(_vectors(out).values())
+    return out if is_response else {c.name: [c] for c in source.channels}
+
+
+def _vectors(groups: Mapping[str, Sequence[RawChannel]]) -> dict[str, RawChannel]:
+    """Return the first channel of each group; single numbers are settings if there are vectors."""
+    first = {path: channels[0] for path, channels in groups.items()}
+    return {path: channel for path, channel in first.items() if channel.size > 1} or first
