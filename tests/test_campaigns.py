@@ -40,6 +40,12 @@ def test_each_device_is_a_row_and_a_failure_is_one_too(tmp_path):
     temperature = truth.set_index("device").loc[good["device"], "temperature"]
     assert good["temperature"].tolist() == pytest.approx(temperature.tolist())
     assert (table["seconds"] > 0).all()
+    assert (good["assumed"] == "alpha").all()
+    fit = di.fit(
+        di.read_frequency_response([tmp_path / f"d000_r{r}.csv" for r in (0, 1)]), di.Dahl()
+    )
+    assert good["u_alpha"].iloc[0] == pytest.approx(fit.params["alpha"].stderr)
+    assert "alpha" not in population(table).parameters
 
 
 def test_a_fit_without_an_uncertainty_is_left_out_and_named(tmp_path):
@@ -119,6 +125,8 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "reports": ({"output__reports": "no"}, "expected true or false"),
     "date": ({"fit__noise": date(2026, 1, 1)}, "a date or a time"),
     "law": ({"model": [{"kind": "dal"}]}, "^the campaign: .*did you mean 'dahl'"),
+    "laws' path": ({"laws": "\0"}, "^the campaign: .*: the file of laws cannot be read: embedded"),
+    "folder's path": ({"output__folder": "\0"}, "the folder cannot be made: embedded null"),
     "value": ({"model": [{"kind": "dahl", "f_max": "abc"}]}, "f_max: expected real .* got 'abc'"),
 }
 

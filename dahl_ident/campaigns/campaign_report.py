@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dahl_ident.campaigns.population import USABLE, Population, PopulationParameter
+from dahl_ident.campaigns.population import (
+    USABLE,
+    Population,
+    PopulationParameter,
+    assumed_in,
+    unit_in,
+)
 from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.reporting.document import (
     Block,
@@ -111,7 +117,8 @@ def _unusable(table: pd.DataFrame) -> Block:
 
 
 def _all_fits(table: pd.DataFrame, folder: str) -> Iterator[Block]:
-    names = [str(c) for c in table if f"u_{c}" in table]
+    assumed = assumed_in(table)
+    names = sorted((str(c) for c in table if f"u_{c}" in table), key=assumed.__contains__)
     labels = [c for c in ("device", "run") if c in table]
     rows = []
     for _, row in table.head(_LISTED).iterrows():
@@ -126,11 +133,8 @@ def _all_fits(table: pd.DataFrame, folder: str) -> Iterator[Block]:
                 for text, x in zip(texts, (value, u), strict=True)
             ]
         rows.append(tuple(cells))
-    units = {
-        c: f" [{table[f'unit_{c}'].dropna().iloc[0]}]" if f"unit_{c}" in table else ""
-        for c in names
-    }
-    header = [h for c in names for h in (f"{c}{units[c]}", "u")]
+    units = {c: unit_in(table, c) for c in names}
+    header = [h for c in names for h in (f"{c} [{units[c]}]" if units[c] else c, "u")]
     yield TextTable(
         "Estimates and combined standard uncertainties", (*labels, "status", *header), tuple(rows)
     )

@@ -57,6 +57,7 @@ _COLUMNS = {
     "status",
     "error",
     "statements",
+    "assumed",
     "points",
     "runs",
     "digests",
@@ -119,7 +120,7 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         name, folder = str(path), path.resolve().parent
     try:
         return _checked(name, folder, content)
-    except (ModelError, ValidationError) as exc:
+    except (DataError, ModelError, ValidationError) as exc:
         raise DataError(f"{name}: {exc}") from exc
 
 

@@ -268,7 +268,8 @@ def population(
         Table of a campaign: one row per fit, with `device`, `status`, and for each parameter ``p``
         its value ``p`` and its combined standard uncertainty ``u_p``.
     parameters : sequence of str, optional
-        Parameters to evaluate; by default every column that has an uncertainty.
+        Parameters to evaluate; by default every column that has an uncertainty, except exponents
+        that nobody gave (column `assumed`): their estimates share a prior.
     covariates : sequence of str, optional
         Columns on which the parameters may depend linearly.
     order : str, optional
@@ -351,8 +352,22 @@ def _parameters(table: pd.DataFrame, names: Sequence[str] | None) -> list[str]:
 
 
 def _estimated(table: pd.DataFrame) -> list[str]:
+    """Return the parameters with an uncertainty, without assumed ones, which share their prior."""
     columns = [str(c) for c in table if f"u_{c}" in table]
-    return [c for c in columns if not c.startswith("posterior_")]
+    assumed = assumed_in(table)
+    return [c for c in columns if not c.startswith("posterior_") and c not in assumed]
+
+
+def assumed_in(table: pd.DataFrame) -> set[str]:
+    """Return the parameters that nobody gave, and that a fit of the table has assumed."""
+    texts = table["assumed"].dropna().unique() if "assumed" in table else ()
+    return {name for text in texts for name in text.split(" | ")}
+
+
+def unit_in(table: pd.DataFrame, name: str) -> str:
+    """Return the unit of a parameter; of a dimensionless one, and without a column, none."""
+    units = table[f"unit_{name}"].dropna() if f"unit_{name}" in table else ()
+    return next(map(str, units), "")
 
 
 def _require(table: pd.DataFrame, columns: Sequence[str]) -> None:
@@ -401,7 +416,7 @@ def _parameter_statistics(
     charts = _charts(y - X[:, 1:] @ b[1:], device, inside, ordered)
     return PopulationParameter(
         name=name,
-        unit=str(table[f"unit_{name}"].iloc[0]) if f"unit_{name}" in table else "",
+        unit=unit_in(table, name),
         logarithmic=logarithmic,
         coefficients=dict(
             zip(["mean", *covariates], zip(b.tolist(), u_b.tolist(), strict=True), strict=True)

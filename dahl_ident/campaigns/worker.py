@@ -182,12 +182,15 @@ def _row(result: FitResult) -> Row:
     row: Row = {
         "status": result.status.value,
         "statements": list(result.statements),
+        "assumed": list(result.assumed),
         "points": len(result.data.response),
         "runs": len(result.data.runs or ()) or 1,
     }
     for name, estimate in result.params.items():
         row[name] = estimate.value
         row[f"unit_{name}"] = estimate.unit
+        if name in result.assumed and estimate.stderr is not None:
+            row[f"u_{name}"] = estimate.stderr
     try:
         budget = result.budget()
     except FitError:  # no finite uncertainty; the statements say why

@@ -112,8 +112,9 @@ def make_folder(folder: Path, *, parents: bool = True) -> None:
     """Make a folder if it does not exist."""
     try:
         folder.mkdir(parents=parents, exist_ok=True)
-    except OSError as exc:
-        raise DataError(f"{folder}: the folder cannot be made: {exc.strerror or exc}") from exc
+    except (OSError, ValueError) as exc:
+        why = getattr(exc, "strerror", None) or exc
+        raise DataError(f"{folder}: the folder cannot be made: {why}") from exc
 
 
 def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:

@@ -51,7 +51,8 @@ def load_laws(path: str | Path) -> tuple[type[Element], ...]:
     >>> [law.kind for law in load_laws(file)]
     ['Hardening']
     """
-    return laws_of(LawFile(str(Path(path).resolve()), read_text(path, "the file of laws")))
+    text = read_text(path, "the file of laws")
+    return laws_of(LawFile(str(Path(path).resolve()), text))
 
 
 def user_laws(elements: Iterable[Element]) -> list[type[Element]]:
