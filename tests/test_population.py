@@ -131,6 +131,19 @@ def test_charts_show_time_only_where_an_order_is_stated():
     )
 
 
+def test_few_devices_are_said_to_be_few():
+    """The posterior falls as tau^-freedom: tau^2 has a mean from 4 degrees of freedom on."""
+    table, _ = simulated(1, 6, 1, slope=0.1, tau=0.05, omega=0.0, u=0.01)
+    said = "4 devices are few for a mean, 1 slope and a scatter, whose uncertainties have heavy "
+    few = population(table[:4], covariates=["t"])
+    assert said in str(few["f_max"])
+    assert str(few).count(f"{said}tails: measure at least 6") == 1
+    assert "4 devices are few for a mean and a scatter" in str(population(table[:4])["f_max"])
+    assert "few" not in str(population(table, covariates=["t"])["f_max"])
+    with pytest.raises(DataError, match=r"3 devices .* with 1 covariate needs at least 4"):
+        population(table[:3], covariates=["t"])
+
+
 def test_wrong_tables_are_named():
     table, _ = simulated(0, 5, 1, slope=0.0, tau=0.02, omega=0.0, u=0.01)
     cases: list[tuple[pd.DataFrame, dict[str, Any], type[DahlIdentError], str]] = [

@@ -50,7 +50,7 @@ def campaign_document(
             verdict.append(f"{'; '.join(str(p).splitlines())}.")
             sections.append(Section(f"Population: {p.name}", tuple(_population_blocks(p))))
     else:
-        verdict.append("Fewer than three devices have usable results: there is no population.")
+        verdict.append("Too few devices have usable results: there is no population.")
     sections.append(Section("Fits that cannot be used", (_unusable(table),)))
     sections.append(Section("All fits", tuple(_all_fits(table, reports))))
     facts = {"statuses": {str(k): int(v) for k, v in statuses.items()}}

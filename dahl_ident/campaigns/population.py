@@ -29,6 +29,7 @@ from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.data.readers import is_frame
 from dahl_ident.diagnostics.formatting import interval, with_unit
 from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.units import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,6 +42,9 @@ _LARGEST_TAU = 20.0  # in REML, in standard deviations of the estimates
 _FALSE_ALARMS = 0.01  # probability that any device is called outlying if none is
 # Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations
 EWMA_WEIGHT, EWMA_WIDTH = 0.2, 2.86
+# Degrees of freedom of the scatter. Its likelihood falls as tau^-freedom, so that with flat priors
+# its posterior exists from 2 on, and the variance of the coefficients, of order tau^2, from 4 on.
+_FEWEST, _ENOUGH = 2, 4
 # Mean difference of two normal numbers, in standard deviations (1.128)
 _MOVING_RANGE = 2.0 / np.sqrt(np.pi)
 
@@ -178,10 +182,23 @@ class PopulationParameter:
                 lines.append(f"scatter of {quantity} between {groups}: {median:.2g} ({limits})")
         if self.out_of_control:
             lines.append(f"fits outside the control limits: {len(self.out_of_control)}")
+        lines += [self.few_devices] if self.few_devices else []
         names = ", ".join(self.outlying)
         outlying = f"{names}, not in these numbers" if names else "no device"
         lines.append(f"outside the population: {outlying}")
         return "\n".join(lines)
+
+    @property
+    def few_devices(self) -> str:
+        """Sentence on too few devices for finite variances; empty if there are enough."""
+        n, slopes = len(self.devices) - len(self.outlying), len(self.coefficients) - 1
+        if n - slopes - 1 >= _ENOUGH:
+            return ""
+        also = f", {counted(slopes, 'slope')}" if slopes else ""
+        return (
+            f"{n} devices are few for a mean{also} and a scatter, whose uncertainties have heavy "
+            f"tails: measure at least {slopes + 1 + _ENOUGH}"
+        )
 
     @property
     def outlying(self) -> tuple[str, ...]:
@@ -250,7 +267,8 @@ class Population:
     def __str__(self) -> str:
         unused = ", ".join(f"{count} {status}" for status, count in self.left_out.items())
         head = f"{self.used} fits used" + (f"; left out: {unused}" if unused else "")
-        return f"{head}\n{self.summary()}"
+        few = dict.fromkeys(p.few_devices for p in self.parameters.values() if p.few_devices)
+        return "\n".join([head, str(self.summary()), *few])
 
 
 def population(
@@ -286,7 +304,8 @@ def population(
     Raises
     ------
     DataError
-        If a column is missing or not numeric, or fewer than three devices are usable.
+        If a column is missing or not numeric, or fewer devices are usable than three and one for
+        each covariate.
     ValidationError
         If a covariate is the same in every fit, or a linear combination of others.
 
@@ -321,16 +340,21 @@ def population(
     chosen = table.loc[usable]
     if order is not None:
         chosen = chosen.sort_values(order, kind="stable")
-    if chosen["device"].nunique() < 3:
+    if (n := chosen["device"].nunique()) < (least := fewest_devices(covariates)):
+        also = f" with {counted(len(covariates), 'covariate')}" if covariates else ""
         raise DataError(
-            f"{chosen['device'].nunique()} devices have usable results; a population needs at "
-            "least three"
+            f"{n} devices have usable results; a population{also} needs at least {least}"
         )
     evaluated = {
         name: _parameter_statistics(chosen, name, list(covariates), order is not None)
         for name in names
     }
     return Population(evaluated, len(chosen), {str(k): int(v) for k, v in left_out.items()})
+
+
+def fewest_devices(covariates: Sequence[str]) -> int:
+    """Return the least number of devices for a population with these covariates."""
+    return 1 + len(covariates) + _FEWEST
 
 
 def with_final_status(table: pd.DataFrame, parameters: Sequence[str] | None = None) -> pd.DataFrame:
@@ -510,8 +534,7 @@ def _outlying(data: _Fits) -> tuple[FloatArray, BoolArray]:
     """Return each device's p value against all others, and which are outlying.
 
     Outlying devices are removed one by one, the most distant first, so that they do not mask one
-    another; at most half of the devices are removed, and two degrees of freedom of the scatter
-    remain, without which its posterior is not integrable.
+    another; at most half of the devices are removed, and enough remain for a scatter.
     """
     p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
     kept, numbers = data, np.arange(data.devices)
@@ -521,7 +544,7 @@ def _outlying(data: _Fits) -> tuple[FloatArray, BoolArray]:
         fits = kept.device == worst
         others = kept.select(~fits)
         freedom = others.devices - others.X.shape[1]
-        if freedom < 2 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
+        if freedom < _FEWEST or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
             break
         tau, omega = _reml(others)
         solution = others.solve(tau, omega)

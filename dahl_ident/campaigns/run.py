@@ -133,12 +133,18 @@ class Campaign:
             not set.
         """
         from dahl_ident.campaigns.campaign_report import FORMATS, campaign_document
-        from dahl_ident.campaigns.population import USABLE, population, with_final_status
+        from dahl_ident.campaigns.population import (
+            USABLE,
+            fewest_devices,
+            population,
+            with_final_status,
+        )
         from dahl_ident.reporting.publish import content_of
 
         place = place_of(path, "a campaign's report", FORMATS)
         table = with_final_status(self.table)
-        enough = table.loc[table["status"].isin(USABLE), "device"].nunique() >= 3
+        n = table.loc[table["status"].isin(USABLE), "device"].nunique()
+        enough = n >= fewest_devices(covariates)
         evaluated = population(table, covariates=covariates, order=order) if enough else None
         reports = Path(os.path.relpath(self.folder / "reports", place.parent)).as_posix()
         document = campaign_document(table, evaluated, title, reports)
