@@ -303,3 +303,6 @@ def test_rotation_is_a_hinge_and_torques():
     assert "Rotational" in str(fit.export("modelica"))
     assert "f_max [N m],sigma [N m/rad]" in str(fit.export("draws", size=1))
     assert "forces with a memory, N m" in str(fit.export("c"))
+    inertia = di.Mass(0.02).dynamic_stiffness(angle, 2.0 * np.pi) * (N / abs(N))
+    alone = di.fit(di.FrequencyResponse(np.ones(12), inertia, angle, motion="rotation"), di.Mass())
+    assert 'type="hinge"' in str(alone.export("mujoco"))

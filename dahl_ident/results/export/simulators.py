@@ -69,8 +69,7 @@ def device(result: Any, form: str, supported: Mapping[str, str]) -> Device:
             )
         if supported[element.kind]:
             notes.append(f"{element.kind}: {supported[element.kind]}")
-    units = {p.unit for p in result.params.values()}
-    rotation = any("rad" in unit or unit.startswith("N m") for unit in units)
+    rotation = result.problem.motion == "rotation"
     return Device(tuple(laws), **lumped, rotation=rotation, notes=tuple(notes))
 
 
