@@ -51,6 +51,31 @@ class OneWay(di.Friction):
         return stiff * (1.0 - direction * force / (f_max * (1.5 + 0.5 * direction)))
 
 
+class Relaxing(di.Friction):
+    """A spring and a damper in series, with a time constant."""
+
+    parameters = (positive("stiff", "N/m"), positive("tau", "s"))
+    scale_parameters = ("stiff",)
+    rate_independent = False
+
+    def slope(self, force, direction, velocity, values):
+        stiff, tau = values
+        return stiff - direction * force / (tau * (abs(velocity) + 1e-12))
+
+
+class Stribeck(di.Friction):
+    """Dahl's law whose limit is larger at low speed."""
+
+    parameters = (positive("stiff", "N/m"), positive("f_max", "N"), positive("speed", "m/s"))
+    scale_parameters = ("stiff", "f_max")
+    rate_independent = False
+
+    def slope(self, force, direction, velocity, values):
+        stiff, f_max, speed = values
+        limit = f_max * (1.0 + 0.5 * np.exp(-((velocity / speed) ** 2)))
+        return stiff * (1.0 - direction * force / limit)
+
+
 STIFF, DELTA = 30.0, 3e-3
 MASS, DAMPING, SPRING = 0.3, 0.24, 0.5
 TRUTH = {"stiff": STIFF, "delta": DELTA, "f_max": STIFF * DELTA}
@@ -143,6 +168,16 @@ def test_a_law_that_always_slips_determines_its_force():
         (kept,) = found.combinations
         assert kept.expression == expression
         assert kept.value == pytest.approx(STIFF * DELTA, rel=0.01)
+
+
+def test_a_time_constant_or_a_speed_far_from_the_data_leaves_the_stiffness_determined():
+    A = np.geomspace(1e-3, 3e-2, 8)
+    elastic = np.full(8, STIFF + 0.0j)
+    sliding = di.Dahl(STIFF * DELTA, STIFF, 1.0).describing_function(A)
+    for law, Z in ((Relaxing, elastic), (Stribeck, sliding)):
+        found = di.fit(di.FrequencyResponse(np.ones(8), noisy(Z, 1e-4), A), law(), throw=False)
+        assert found.params["stiff"].value == pytest.approx(STIFF, rel=1e-3)
+        assert [found.verdict_on(found.var_names[i])[0].known for i in (0, -1)] == [True, False]
 
 
 def test_like_elements_of_any_law_are_ordered_by_their_knees():

@@ -276,10 +276,11 @@ def limits(problem: TableProblem) -> list[Limit]:
 def _limits_of(
     problem: TableProblem, element: Element, asymptote: Asymptote, springs: list[Parameter]
 ) -> list[Limit]:
-    """Return the limits of an asymptote: one for each free spring if it adds to a spring.
+    """Return the limits of an asymptote: one, or one for each spring to which it adds.
 
-    There are none if a parameter that it pins, or that runs away, is not free.
+    There is none if a parameter that it pins, or that runs away, is given.
     """
+    names, added = problem.names, asymptote.adds_to_spring
     free = {label for label, p in zip(element.labels, element.parameters, strict=True) if p.free}
     if not {*asymptote.pinned, *asymptote.runs_away} <= free:
         return []
@@ -289,40 +290,37 @@ def _limits_of(
         pins[p.name] = np.log(np.asarray(value)) if p.positive else value
     follow = None
     if asymptote.follows is not None:
-        label, followed, factor = asymptote.follows
-        pair, distance = [element.parameter(x) for x in (label, followed)], np.log(factor)
-        tying = _tying(element)
-        if followed in free:
-            alone = asymptote.adds_to_spring is None and springs
-            if alone and tying is not None and followed == tying.adds_to_spring:
-                return []  # in parallel with a spring the law has no effect
-            follow = pair[0].name, pair[1].name, distance
-        elif asymptote.adds_to_spring is not None:
+        label, other_label, factor = asymptote.follows
+        follower, other = element.parameter(label), element.parameter(other_label)
+        if other.free:
+            tying = _tying(element)
+            is_spring = tying is not None and other_label == tying.adds_to_spring
+            if is_spring and springs and added is None:
+                return []  # the law is a second spring in parallel with a free one
+            follow = follower.name, other.name, np.log(factor)
+        elif added is not None:
             return []
         else:
-            pins[pair[0].name] = distance + np.log(pair[1].value or np.nan)
-    combined = [(element.named(x), _powers(element, by, problem)) for x, by in asymptote.kept]
+            pins[follower.name] = np.log(factor) + np.log(other.value or np.nan)
+    combined = [(element.named(x), _powers(element, y, problem)) for x, y in asymptote.kept]
     kept = tuple((text, powers) for text, powers in combined if powers.any())
     limit = Limit(
-        problem.names,
+        names,
         Status.__members__.get(asymptote.name.upper(), Status.RUNS_AWAY),
         asymptote.meaning,
         _chart(problem, pins, follow, [powers for _, powers in kept]),
         {element.parameter(x).name: value for x, value in asymptote.runs_away.items()},
         kept,
     )
-    if asymptote.adds_to_spring is None:
+    if added is None:
         return [limit]
-    sigma = problem.names.index(element.parameter(asymptote.adds_to_spring).name)
-    ties = {p.name: (problem.names.index(p.name), sigma) for p in springs}
-    return [
-        replace(
-            limit,
-            chart=replace(limit.chart, tied=tied),
-            extremes={**limit.extremes, spring: -np.inf},
-        )
-        for spring, tied in ties.items()
-    ]
+    limits = []
+    for spring in springs:
+        tied = names.index(spring.name), names.index(element.parameter(added).name)
+        extremes = {**limit.extremes, spring.name: -np.inf}
+        chart = replace(limit.chart, tied=tied)
+        limits.append(replace(limit, chart=chart, extremes=extremes))
+    return limits
 
 
 def _vanishing(problem: TableProblem, axes: Directions) -> list[Asymptote]:
@@ -347,47 +345,52 @@ def _vanishing(problem: TableProblem, axes: Directions) -> list[Asymptote]:
 
 
 def _far_out(problem: TableProblem, axes: Directions) -> list[Asymptote]:
-    """Return limits far out in every direction with a unit, on either side of the data."""
-    view, label = problem.stiffness_data, axes.element.label
-    far_out = []
+    """Return the limits of a law that declares none: the two ends of each direction with a unit.
+
+    At one end of a length the element sticks at every amplitude, with a finite stiffness; at the
+    other it slips at every amplitude, with a finite force.
+    """
+    view, label, reference = problem.stiffness_data, axes.element.label, axes.reference
+    asymptotes = []
     for direction in axes.nonlinear:
-        if direction.is_number or not direction.parameter.positive:
-            continue
         p, over = direction.parameter, direction.over
-        size, rising = direction.sizes(view), direction.dimension[1] > 0
-        above, below = _LIMIT_LENGTHS if direction.dimension[1] >= 0 else _LIMIT_LENGTHS[::-1]
-        for far, value in (
-            (np.exp(size.max(axis=-1)) * above, np.inf),
-            (np.exp(size.min(axis=-1)) / below, 0.0),
+        if direction.is_number or not p.positive:
+            continue
+        _, length, time = direction.dimension
+        ln_size = direction.sizes(view)
+        above, below = _LIMIT_LENGTHS if length >= 0 else _LIMIT_LENGTHS[::-1]
+        for end, far in (
+            (np.inf, np.exp(ln_size.max(axis=-1)) * above),
+            (0.0, np.exp(ln_size.min(axis=-1)) / below),
         ):
-            sticks = np.isinf(value) == rising
-            meaning = "no amplitude reaches slip" if sticks else "every amplitude slips"
-            if direction.dimension[2]:
-                side = "below" if np.isinf(value) else "above"
-                meaning = f"the data lie far {side} {p.name}"
-            runs_away, kept = {label(p): value}, []
+            sticks = (end > 0.0) == (length > 0)
+            if time:
+                meaning = f"the data lie far {'below' if end else 'above'} {p.name}"
+            else:
+                meaning = "no amplitude reaches slip" if sticks else "every amplitude slips"
+            runs_away, kept = {label(p): end}, []
             if over is not None and over.free:
-                # of two parameters with a fixed ratio, that with the unit of the limit stays finite
-                stays = over if sticks == (over.dimension[1] < p.dimension[1]) else p
-                if stays is p:
-                    runs_away = {label(over): np.inf if value == 0.0 else 0.0}
-                kept = [(label(stays), {label(stays): 1.0})]
-            elif axes.is_free and axes.reference is not None:
-                # a law that never slips has a finite stiffness, one that always slips a finite
-                # force
-                unit, reference = -1 if sticks else 0, label(axes.reference)
-                power = (unit - axes.reference.dimension[1]) / direction.dimension[1]
-                times = "" if power == 1.0 else f"^{power:g}"
-                kept = [(reference, {reference: 1.0})]
+                # the stiffness stays finite if the element sticks, the force if it slips
+                finite = over if sticks == (over.dimension[1] < p.dimension[1]) else p
+                if finite is p:
+                    runs_away = {label(over): 0.0 if end else np.inf}
+                kept = [(label(finite), {label(finite): 1.0})]
+            elif axes.is_free and reference is not None and not time:
+                # the product that has the unit of a stiffness or of a force stays finite
+                power = ((-1 if sticks else 0) - reference.dimension[1]) / length
+                powers, expression = {label(reference): 1.0}, label(reference)
                 if power:
-                    kept = [(f"{reference} {label(p)}{times}", {reference: 1.0, label(p): power})]
-                    runs_away[reference] = np.inf
-            fixed, follows = {label(p): far}, None
-            if over is not None:
-                fixed, follows = {}, (label(p), label(over), far)
-            limit = Asymptote("runs_away", meaning, fixed, follows, runs_away, tuple(kept))
-            far_out.append(limit)
-    return far_out
+                    powers[label(p)] = power
+                    expression += f" {label(p)}" + (f"^{power:g}" if power != 1.0 else "")
+                    runs_away[label(reference)] = np.inf
+                kept = [(expression, powers)]
+            if over is None:
+                pinned, follows = {label(p): far}, None
+            else:
+                pinned, follows = {}, (label(p), label(over), far)
+            limit = Asymptote("runs_away", meaning, pinned, follows, runs_away, tuple(kept))
+            asymptotes.append(limit)
+    return asymptotes
 
 
 def _powers(element: Element, powers: Mapping[str, float], problem: TableProblem) -> FloatArray:
