@@ -190,7 +190,10 @@ class PowerDamperByHand:
 
 
 def dahl_branch(z: float, path: float, alpha: float) -> float:
-    """Return 1 - s F/limit, z before, after a path of dF/dx = sigma z^alpha, in limit/sigma."""
+    """Return 1 - s F/limit after a path in units of limit/sigma; before the path it is z.
+
+    The law is dF/dx = sigma (1 - s F/limit)^alpha.
+    """
     if alpha == 1.0 or z <= 0.0:
         return max(z, 0.0) * float(np.exp(-path))
     change = (alpha - 1.0) * path * z ** (alpha - 1.0)
@@ -198,23 +201,29 @@ def dahl_branch(z: float, path: float, alpha: float) -> float:
 
 
 def dahl_history(law: DahlByHand, x: FloatArray) -> FloatArray:
-    """Return the force at places between which the motion is monotone, from rest mid-gap.
+    """Return the force at the displacements x, (n,), from rest in the middle of the gap.
 
-    In closed form from place to place; for what does not depend on velocity.
+    The closed form of a law that does not depend on velocity, for a motion that is monotone from
+    each displacement to the next.
     """
     alpha, half_gap = law.alpha, 0.5 * (law.gap or 0.0)
-    force, play, forces = 0.0, 0.0, [0.0]
+    force, position_in_gap, forces = 0.0, 0.0, [0.0]
     for step in np.diff(x).tolist():
+        if step == 0.0:
+            forces.append(force)
+            continue
         s, path = float(np.sign(step)), abs(step)
         limit = law.f_max * (1.0 + s * law.asymmetry)
-        z, to_zero = 1.0 - s * force / limit, 0.0
-        if law.gap is not None and z > 1.0:  # back to where the gap is crossed
+        z = 1.0 - s * force / limit
+        unloading = 0.0  # path to zero force, where the motion across the gap begins
+        if law.gap is not None and z > 1.0:
             u = np.log(z)
-            to_zero = u if alpha == 1.0 else np.expm1((1.0 - alpha) * u) / (1.0 - alpha)
-            to_zero *= limit / law.sigma
-        if law.gap is not None and path >= to_zero and s * force <= 0.0:
-            crossed = min(path - to_zero, half_gap - s * play)
-            z, play, path = 1.0, play + s * crossed, path - to_zero - crossed
+            unloading = u if alpha == 1.0 else np.expm1((1.0 - alpha) * u) / (1.0 - alpha)
+            unloading *= limit / law.sigma
+        if law.gap is not None and s * force <= 0.0 and path >= unloading:
+            crossed = min(path - unloading, half_gap - s * position_in_gap)
+            position_in_gap += s * crossed
+            z, path = 1.0, path - unloading - crossed
         force = s * limit * (1.0 - dahl_branch(z, path * law.sigma / limit, alpha))
         forces.append(force)
     return np.array(forces)

@@ -414,6 +414,13 @@ def test_derivatives_of_settled_motions_are_differences_of_oracles():
     assert np.max(np.abs(result.by_amplitude[0] * drive - slopes[6])) < 1e-6 * size
 
 
+def test_the_closed_form_of_a_history_keeps_its_force_at_rest():
+    x = np.cumsum(0.01 * seeded(51).standard_normal(12))
+    law = DahlByHand(1.0, 300.0, gap=0.004)
+    at_rest = np.repeat(dahl_history(law, x), 2)
+    np.testing.assert_array_equal(dahl_history(law, np.repeat(x, 2)), at_rest)
+
+
 def test_derivatives_along_a_history_jump_at_kinks():
     rng = seeded(50)
     spline = CubicSpline(np.linspace(0.0, 1.0, 12), 0.01 * rng.standard_normal(12))
