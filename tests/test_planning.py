@@ -392,7 +392,7 @@ class TestPlan:
         assert plan.reached
         hours = re.match(r"1 level in \S+ s \((\S+) h\); meets the target", str(plan))[1]
         assert float(hours) == pytest.approx(plan.seconds / 3600.0, rel=0.05)
-        share = re.search(r"limit of displacement costs the time.* in 1/(\d+) of it", str(plan))[1]
+        share = re.search(r"limit of displacement costs time.* in 1/(\d+) of the", str(plan))[1]
         assert float(share) == pytest.approx(100.0, rel=0.2)
 
     def test_least_time_with_scatter_takes_as_few_runs_as_needed(self):

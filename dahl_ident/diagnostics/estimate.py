@@ -371,14 +371,18 @@ class LinearRows:
 def _minimum(
     optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
 ) -> WeightedEstimate:
-    """Return the minimum that a search from theta finds."""
+    """Return the minimum that a Gauss-Newton search from theta reaches.
+
+    Each step computes the weights anew, which makes the steps a geometric series; they are
+    extrapolated to its limit. A step that does not lower the cost is repeated with more damping.
+    """
     stated, basis = problem.widened(np.zeros(problem.data.n)), Basis.every(len(theta))
     loss, m = loss_named(optimum.loss, problem.residuals_per_row), problem.n_residuals
     if not determined:
         _, J = stated.residuals_and_jacobian(theta)
         basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
-    last: FloatArray | None = None
     damping, bounds = 0.0, problem.bounds()
+    last_change: FloatArray | None = None  # of the residuals; None after a step that is not plain
     for _ in range(_GAUSS_NEWTON_STEPS):
         variance, scale = _weights(stated, theta, loss)
         weighted = stated.widened(variance)
@@ -389,30 +393,29 @@ def _minimum(
         if not (np.isfinite(y).all() and np.isfinite(columns).all()):
             raise np.linalg.LinAlgError("no finite step from the estimate")
         step = _step(columns, y, theta, basis, bounds)
-        size = np.linalg.norm(columns @ step)
-        if size < _SETTLED:
+        change = columns @ step
+        if np.linalg.norm(change) < _SETTLED:
             break
-        moved = columns @ step
-        factor = _extrapolation(moved, last)
-        step, last = factor * step, moved if factor == 1.0 else None
-        mean = 1.0 if loss is None else loss.mean_slope(squares_of(r[:m]))
-        cost = _cost(r, m, loss, mean)
+        factor = _extrapolation(change, last_change)
+        step = factor * step
+        last_change = change if factor == 1.0 else None
+        mean_slope = 1.0 if loss is None else loss.mean_slope(squares_of(r[:m]))
+        cost = _cost(r, m, loss, mean_slope)
         for _ in range(_STEP_TRIALS):
             if damping:
+                last_change = None
                 rows = np.diag(np.sqrt(damping) * np.linalg.norm(columns, axis=0))
-                both, last = np.vstack([columns, rows]), None
-                step = _step(both, np.append(y, np.zeros(len(rows))), theta, basis, bounds)
+                damped = np.vstack([columns, rows]), np.append(y, np.zeros(len(rows)))
+                step = _step(*damped, theta, basis, bounds)
             trial = _moved(problem, theta, step, basis)
-            value = weighted.residuals_and_jacobian(trial, scale, tails=loss is None)[0]
-            if np.isfinite(value).all() and _cost(value, m, loss, mean) < cost:
+            r_trial = weighted.residuals_and_jacobian(trial, scale, tails=loss is None)[0]
+            if np.isfinite(r_trial).all() and _cost(r_trial, m, loss, mean_slope) < cost:
                 damping = damping / _DAMPED if damping > _FIRST_DAMPING else 0.0
                 break
             damping = max(_DAMPED * damping, _FIRST_DAMPING)
         else:
             break
         theta = trial
-    if not np.isfinite(y).all():
-        raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
     return WeightedEstimate(weighted, theta, variance, scale, r, J, loss, determined, basis)
 
 
@@ -421,10 +424,10 @@ def scores_of(r: FloatArray, m: int, loss: Loss | None) -> FloatArray:
     return r if loss is None else np.concatenate([loss.scores(r[:m]), r[m:]])
 
 
-def _cost(r: FloatArray, m: int, loss: Loss | None, mean: float) -> float:
+def _cost(r: FloatArray, m: int, loss: Loss | None, mean_slope: float) -> float:
     """Return the sum of squares; with a loss, the function whose gradient the scores give."""
     z = squares_of(r[:m])
-    return float(np.sum(z if loss is None else loss.rho(z) / mean) + r[m:] @ r[m:])
+    return float(np.sum(z if loss is None else loss.rho(z) / mean_slope) + r[m:] @ r[m:])
 
 
 def _step(
@@ -434,27 +437,31 @@ def _step(
     basis: Basis,
     bounds: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Return the Gauss-Newton step; parameters that would leave their bounds end at them."""
-    to_bounds, inside = np.zeros(columns.shape[1]), np.ones(columns.shape[1], dtype=bool)
+    """Return the Gauss-Newton step within bounds.
+
+    A parameter that the step would take beyond a bound is moved to the bound, and the step of the
+    others is computed again. This holds for parameters that one direction of the basis moves.
+    """
     matrix = basis.matrix
     uncoupled = (matrix != 0.0).sum(axis=1) == 1
-    step = to_bounds
+    step, to_bounds = np.zeros((2, columns.shape[1]))
+    free = np.ones(columns.shape[1], dtype=bool)
     for _ in range(len(theta)):
-        free_step = np.linalg.lstsq(columns * inside, -y - columns @ to_bounds, rcond=1e-13)[0]
-        step = to_bounds + inside * free_step
+        solution = np.linalg.lstsq(columns * free, -y - columns @ to_bounds, rcond=1e-13)[0]
+        step = to_bounds + free * solution
         end = theta + matrix @ step
-        within = np.clip(end, *bounds)
-        beyond = np.flatnonzero(uncoupled & (end != within))
+        end_within = np.clip(end, *bounds)
+        beyond = np.flatnonzero(uncoupled & (end != end_within))
         directions = np.abs(matrix[beyond]).argmax(axis=1)
-        if inside[directions].sum() == 0:
+        if not free[directions].any():
             break
-        inside[directions] = False
-        to_bounds[directions] = (within - theta)[beyond] / matrix[beyond, directions]
+        free[directions] = False
+        to_bounds[directions] = (end_within - theta)[beyond] / matrix[beyond, directions]
     return np.asarray(step)
 
 
 def _extrapolation(moved: FloatArray, last: FloatArray | None) -> float:
-    """Return the factor that takes a step of a geometric series to the limit of the series."""
+    """Return the factor that extends a step of a geometric series to the limit of the series."""
     ratio = 0.0 if last is None else float(moved @ last) / max(float(last @ last), TINY)
     return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
 

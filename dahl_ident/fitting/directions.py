@@ -391,7 +391,8 @@ def _offsets(span: int, most: float) -> IntArray:
 def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> NodeCurves:
     """Return an element whose curve is scaled by lengths, from tables over ln(A/length).
 
-    Lengths are multiples of the shortest.
+    There is a table for each combination of numbers and of multiples of the shortest length. The
+    nodes are those of the shortest length in the first combination, then in the second, and so on.
     """
     numbers = [x for x in d.nonlinear if x.is_number]
     ordered = [*d.lengths, *numbers]
@@ -399,44 +400,42 @@ def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> NodeCu
     axes = [_powers(x, multiples) for x in d.lengths] + [_numbers(x) for x in numbers]
     counts = [a.size for a in axes]
     index = np.indices(counts).reshape(len(counts), -1)
-    shortest = [index[i] % multiples.size == 0 for i in range(len(d.lengths))]
-    index = index[:, np.any(shortest, axis=0)]
+    multiple = index[: len(d.lengths)] % multiples.size  # negative values follow the positive ones
+    index = index[:, (multiple == 0).any(axis=0)]
     index = index[:, _possible(d, ordered, axes, index)]
     allowed = max(2, int(min(_MOST_TABLES, most / 6.0)))
     if index.shape[1] > allowed:
         chosen = np.random.default_rng(1).choice(index.shape[1], allowed, replace=False)
         index = index[:, np.sort(chosen)]
-    combinations = np.array([a[i] for a, i in zip(axes, index, strict=True)]).T
-    position = np.rint(np.log(view.amplitude) / _LOG_STEP).astype(np.intp)
-    low = position.min(axis=-1)
-    span = int((position.max(axis=-1) - low).max())
-    offsets = _offsets(span, max(6.0, most / len(combinations)))
-    ln_length = low[..., None] + offsets
-    at = position[..., None, :] - (ln_length[..., None] + _LOWEST)
-    at = np.clip(at, 0, _NODES)
+    # values of the directions at a shortest length of 1, a row for each combination
+    unit_values = np.array([a[i] for a, i in zip(axes, index, strict=True)]).T
+
+    amplitude = np.rint(np.log(view.amplitude) / _LOG_STEP).astype(np.intp)  # ln A in steps
+    smallest = amplitude.min(axis=-1)
+    span = int((amplitude.max(axis=-1) - smallest).max())
+    offsets = _offsets(span, max(6.0, most / len(unit_values)))
+    length = smallest[..., None] + offsets  # ln of the shortest length in steps
+    in_table = np.clip(amplitude[..., None, :] - length[..., None] - _LOWEST, 0, _NODES)
     order = np.searchsorted(view.orders, view.harmonic)
-    curve = np.concatenate(
-        [_table(d, ordered, tuple(c.tolist()), view.orders)[order, at] for c in combinations],
-        axis=-2,
-    )
-    K = len(combinations)
-    ln_lengths = np.concatenate([ln_length] * K, axis=-1) * _LOG_STEP
-    values = {}
-    for column, direction in enumerate(ordered):
-        unit = np.repeat(combinations[:, column], offsets.size)
-        power = direction.dimension[1]
-        values[direction.parameter.name] = unit * np.exp(ln_lengths * power) if power else unit
+    tables = (_table(d, ordered, tuple(row), view.orders) for row in unit_values.tolist())
+    curve = np.concatenate([table[order, in_table] for table in tables], axis=-2)
+
+    ln_length = np.tile(length, len(unit_values)) * _LOG_STEP
     assert d.reference is not None
-    values[d.reference.name] = np.ones(K * offsets.size)
-    node = np.arange(K * offsets.size) % offsets.size
-    edges = [node == 0, node == offsets.size - 1]
-    if len(d.lengths) > 1:
-        longest = index[: len(d.lengths)] % multiples.size == multiples.size - 1
-        edges += [np.repeat(far, offsets.size) for far in longest]
+    values = {d.reference.name: np.ones(ln_length.shape[-1])}
+    for direction, column in zip(ordered, unit_values.T, strict=True):
+        at_unit, power = np.repeat(column, offsets.size), direction.dimension[1]
+        scaled = at_unit * np.exp(ln_length * power) if power else at_unit
+        values[direction.parameter.name] = scaled
     # the curve at unit length is that of a reference of 1, whatever its dimension
     shift = d.reference.dimension[1] + 1
     if shift:
-        curve = curve / np.exp(ln_lengths[..., None] * shift)
+        curve = curve / np.exp(ln_length[..., None] * shift)
+    node = np.tile(np.arange(offsets.size), len(unit_values))
+    edges = [node == 0, node == offsets.size - 1]
+    if len(d.lengths) > 1:
+        at_longest = index[: len(d.lengths)] % multiples.size == multiples.size - 1
+        edges += [np.repeat(at_end, offsets.size) for at_end in at_longest]
     return NodeCurves(values, [LinearPart(d.scale, curve)], None, [e for e in edges if e.any()])
 
 

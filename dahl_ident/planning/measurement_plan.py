@@ -338,11 +338,11 @@ class Plan:
         """Return the gain if the remaining time is used or a limit is wider, and how to use it."""
         time = self.search.question.limits.time
         if self.reached and np.isinf(time):
-            found = {name: _widened(self.search, name) for name in self.target}
+            widened = {name: _widened(self.search, name) for name in self.target}
             return [
-                f"The limit of {limit} costs the time: ten times wider, {name} would be as certain "
-                f"in 1/{gain**2:.2g} of it."
-                for name, (limit, gain) in found.items()
+                f"The limit of {limit} costs time: if it were ten times wider, {name} would be as "
+                f"certain in 1/{gain**2:.2g} of the time."
+                for name, (limit, gain) in widened.items()
                 if gain > _COSTLY
             ]
         if not (self.reached and self.seconds < 0.5 * time):
@@ -360,24 +360,22 @@ class Plan:
     def _table(self) -> str:
         """Return the steps as text, one line each."""
         rows = [_row(step) for step in self.steps]
-        last = ("period", "repeats", "seconds")
-        names = list(dict.fromkeys(n for row in rows for n in row))
-        names = [n for n in names if n not in last] + [n for n in last if n in names]
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        names.sort(key=lambda name: name in ("period", "repeats", "seconds"))  # these come last
         units = {**trajectories.UNITS, "level": "N" if self.controlled == "force" else "m"}
-        headings = [
-            f"{n.removesuffix('_hz').replace('_', ' ')} [{shown_unit(units[n], self.motion)}]"
-            if n in units
-            else n.replace("_", " ")
-            for n in names
-        ]
+        headings = [name.removesuffix("_hz").replace("_", " ") for name in names]
+        for i, name in enumerate(names):
+            if name in units:
+                headings[i] += f" [{shown_unit(units[name], self.motion)}]"
         lines = [
-            [str(i), *(_cell(row.get(n, "-")) for n in names)]
+            [str(i), *(_as_text(row.get(name, "-")) for name in names)]
             for i, row in enumerate(rows, start=1)
         ]
         return table([["", *headings], *lines])
 
 
-def _cell(value: Any) -> str:
+def _as_text(value: float | str) -> str:
+    """Return a number with four digits; a count or a word as it is."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

@@ -31,43 +31,42 @@ _LINEARIZATION_ROWS = 9  # amplitudes, from the smallest to the largest
 
 
 def answer(fit: FitResult) -> TextTable:
-    """Return every free parameter with its interval; unusable numbers are struck."""
+    """Return every estimated parameter with its interval; numbers not to be used are struck."""
     limits = fit.conf_interval().at(CONFIDENCE)
     described = fit.status is not VerdictStatus.NOT_DESCRIBED
     of_device = fit.var_names[: fit.problem.n_reported]
     rows: list[Row] = []
     for name, p in fit.params.items():
-        value, error = rounded(p.value, p.stderr)
-        if name in fit.assumed and p.stderr is not None:
-            limit = limits[name]
-            within = Cell(interval(limit.lower, limit.upper, ""), struck=not described)
-            lost, reason = False, _ASSUMED
-        elif name in of_device:
-            verdict, reason = fit.verdict_on(name)
-            lost = not verdict.known
-            limit = limits[name]
-            # for an undetermined parameter a one-sided limit is valid, a closed interval is not
-            closed = lost and bool(np.isfinite([limit.lower, limit.upper]).all())
-            text = interval(limit.lower, limit.upper, "")
-            within = Cell(text, struck=not described or closed)
-            if not lost:
-                reason = verdict.value
-                if not described:
-                    reason = "the model does not describe the data: the interval is not valid"
-                elif fit.status == VerdictStatus.APPROXIMATE:
-                    reason += "; u includes the misfit"
-        else:
+        is_assumed = name in fit.assumed and p.stderr is not None
+        if not is_assumed and name not in of_device:
             continue
-        struck = lost or not described
+        lower, upper = limits[name].lower, limits[name].upper
+        known, meaning = True, _ASSUMED
+        if not is_assumed:
+            verdict, meaning = fit.verdict_on(name)
+            known = verdict.known
+            if known and not described:
+                meaning = "the model does not describe the data: the interval is not valid"
+            elif known and fit.status is VerdictStatus.APPROXIMATE:
+                meaning = f"{verdict.value}; u includes the misfit"
+            elif known:
+                meaning = verdict.value
+        struck = not (known and described)
+        # for an undetermined parameter a one-sided limit is valid, a closed interval is not
+        closed = bool(np.isfinite([lower, upper]).all())
+        invalid = not described or (not known and closed)
+        value, error = rounded(p.value, p.stderr)
         rows.append(
             {
                 "parameter": name,
                 "estimate": estimated(p.value, value, struck=struck),
                 "standard uncertainty u": Cell(error, _finite(p.stderr), struck),
-                f"{level_text(CONFIDENCE)} interval": within,
+                f"{level_text(CONFIDENCE)} interval": Cell(
+                    interval(lower, upper, ""), struck=invalid
+                ),
                 "unit": p.unit or "-",
                 "description": p.description,
-                "what the data say": reason,
+                "what the data say": meaning,
             }
         )
     crossed = any(isinstance(cell, Cell) and cell.struck for row in rows for cell in row.values())
