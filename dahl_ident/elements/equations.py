@@ -81,9 +81,12 @@ def plant_equations(
                 "build it from Mass, Damper and Spring, or drive the plant by a force"
             )
     if not model.has_inertia:
+        has, remedy = "no mass", "add Mass()"
+        if any(p.is_mass for p in model.parameters):
+            has, remedy = "a mass of 0", "give another, or leave it free"
         raise ModelError(
-            f"{model!r} has no mass, so a force does not determine its motion; add "
-            "Mass(), or give records with measured displacement and force"
+            f"{model!r} has {has}, so a force does not determine its motion; {remedy}, or predict "
+            "the force of a measured displacement"
         )
     applied = u if excitation == "force" else -part.inertia * u
     acceleration = (applied - part.force) / part.inertia

@@ -268,8 +268,8 @@ class ForceLaw(ABC):
 
     @property
     def has_inertia(self) -> bool:
-        """Whether a force determines the motion of the element."""
-        return any(p.is_mass for p in self.parameters)
+        """Whether a force determines the motion of the element; a mass of 0 is none."""
+        return any(p.is_mass and (p.free or p.value != 0.0) for p in self.parameters)
 
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
         """Return the states at the first sample from the unknowns there, in plain arithmetic.
