@@ -223,7 +223,7 @@ def test_what_one_kind_alone_has_is_refused_in_one_way(fit):
 
 def test_a_mass_of_zero_is_no_mass(fit):
     for model, fixed in ((MODEL + di.Mass(0.0), {}), (MODEL + di.Mass(), {"mass": 0.0})):
-        with pytest.raises(ModelError, match="has a mass of 0, .* give another, or leave it free"):
+        with pytest.raises(ModelError, match=r"has a mass of 0, .* give another, or leave it free"):
             di.fit(record(TRUE), model, fixed=fixed, output="motion")
     without = di.fit(record(TRUE + NOISE), MODEL + di.Mass(0.0))
     assert without.params["sigma"].value == pytest.approx(fit.params["sigma"].value, rel=1e-9)
