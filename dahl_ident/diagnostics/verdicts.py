@@ -73,6 +73,13 @@ class Verdict(Enum):
     WEAK = "weakly identified"
     NOT_IDENTIFIED = "not identified"
 
+    @classmethod
+    def of(cls, u: float) -> Verdict:
+        """Return the verdict on a parameter with u, the standard uncertainty of its logarithm."""
+        if u < IDENTIFIED_BELOW:
+            return cls.IDENTIFIED
+        return cls.WEAK if u <= NOT_IDENTIFIED_ABOVE else cls.NOT_IDENTIFIED
+
     @property
     def known(self) -> bool:
         """Whether the estimate can be used."""
@@ -220,10 +227,9 @@ def judged(
     spread = np.maximum(fisher, np.where(np.isnan(by_profile), np.inf, by_profile)).tolist()
     verdicts = {}
     for name, std in zip(problem.names, spread, strict=True):
-        closed = np.isfinite(intervals[name][-1]).all() and std <= NOT_IDENTIFIED_ABOVE
-        verdicts[name] = Verdict.WEAK if closed else Verdict.NOT_IDENTIFIED
-        if std < IDENTIFIED_BELOW:
-            verdicts[name] = Verdict.IDENTIFIED
+        verdicts[name] = Verdict.of(std)
+        if verdicts[name] is Verdict.WEAK and not np.isfinite(intervals[name][-1]).all():
+            verdicts[name] = Verdict.NOT_IDENTIFIED
     not_by_noise = dict[str, str]()
     ambiguous = _ambiguous(optimum)
     if errors is not None:

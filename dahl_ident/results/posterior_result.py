@@ -32,7 +32,7 @@ from dahl_ident.diagnostics.judgement import (
     described,
     determined,
 )
-from dahl_ident.diagnostics.verdicts import IDENTIFIED_BELOW, NOT_IDENTIFIED_ABOVE
+from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
 from dahl_ident.results.fit_result import FitResult
@@ -419,14 +419,15 @@ class Posterior(Result):
         """Yield the positive parameters with wide intervals, except those that priors set."""
         free = (self.fit or self).problem.names
         by_prior = {influence.name for influence in self.prior_influences}
-        u = {
-            name: float(np.diff(np.log(self.quantile(name, _LEVELS[[0, -1]])))[0]) / 4.0
+        verdicts = {
+            name: Verdict.of(np.diff(np.log(self.quantile(name, _LEVELS[[0, -1]])))[0] / 4.0)
             for name, positive in zip(self.names, self._density.logarithmic, strict=True)
             if positive and name in free and name not in by_prior
         }
-        lost = tuple(name for name in u if u[name] > NOT_IDENTIFIED_ABOVE)
-        weak = tuple(name for name in u if IDENTIFIED_BELOW < u[name] <= NOT_IDENTIFIED_ABOVE)
-        known = tuple(name for name in u if name not in lost + weak)
+        known, weak, lost = (
+            tuple(name for name in verdicts if verdicts[name] is verdict)
+            for verdict in (Verdict.IDENTIFIED, Verdict.WEAK, Verdict.NOT_IDENTIFIED)
+        )
         if lost:
             yield determined("undetermined", determined=known, weak=weak, lost=lost)
         elif weak:
