@@ -162,6 +162,15 @@ class TestBudget:
         assert said in str(two.verdict)
         assert two.status == "trusted"
 
+    @pytest.mark.parametrize("seed", [103, 113])
+    def test_so_it_does_for_two_days_that_agree(self, seed):
+        two = fit(three_days(0.0, seed).select(run=["mon", "tue"]), Dahl(alpha=1.0))
+        rows = two.budget().values()
+        assert "scatter between runs" not in {part.source for row in rows for part in row.rows}
+        (said,) = (str(f) for f in two.findings if f.code == "few_runs")
+        assert said.startswith("The scatter of 2 runs has 1 degree of freedom, so the coverage ")
+        assert f"k is up to {max(row.k for row in rows):.3g}; with another run" in said
+
     @pytest.mark.parametrize("scatters", [("sigma",), ("f_max", "sigma")])
     def test_each_parameter_of_friction_scatters_on_its_own(self, scatters):
         """Five days of friction in parallel with a spring and a damper, which do not change."""

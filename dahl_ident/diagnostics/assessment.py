@@ -413,11 +413,16 @@ class TableAssessment(Assessment):
         part = view.stiffness_of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
         return float(np.sqrt(np.mean(np.abs(part) ** 2)))
 
+    @property
+    def runs(self) -> int:
+        """Number of runs; passes over the levels are runs where they scatter."""
+        errors = self.errors_of_combinations
+        return len((self.problem if errors is None else errors.problem).data.runs or ())
+
     def design(self, *, counted: bool) -> dict[str, Any]:
         """Return the assumptions about runs and drift, with all sources of error or noise alone."""
         data = self.problem.data
-        errors = self.errors_of_combinations if counted else None
-        runs = len((data if errors is None else errors.problem.data).runs or ())
+        runs = self.runs if counted else len(data.runs or ())
         passes = runs * (data.run is None)
         return {"single_run": runs < 2, "passes": passes, "no_drift": is_monotonic(data)}
 

@@ -176,6 +176,11 @@ class ParameterBudget:
         """Expanded uncertainty, k u."""
         return self.k * self.u
 
+    def k_without(self, *sources: str) -> float:
+        """Return the coverage factor if what these sources contribute were known exactly."""
+        spread = sum(r.share**2 / r.dof for r in self.rows if r.source not in sources)
+        return coverage_factor(1.0 / spread if spread > 0.0 else np.inf)
+
     @property
     def expanded(self) -> str:
         """U as it is printed, or the interval."""

@@ -17,7 +17,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import warnings_in
 from dahl_ident.diagnostics.assessment import TableAssessment
-from dahl_ident.diagnostics.contributions import NOISE, RUNS
+from dahl_ident.diagnostics.contributions import NOISE, RUNS, TESTS
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.estimate import scores_of
 from dahl_ident.diagnostics.formatting import with_unit
@@ -53,7 +53,7 @@ _LARGEST_RMS_OF_WRONG_LAW = 0.05  # the same if another law has a far smaller mi
 _SLOW = 0.3  # effective share of the samples below which a misfit may look like slow noise
 _VISIBLE = 0.05  # rms of such a misfit, as a share of the output, from which it is reported
 _FEW_DOF = 10.0  # degrees of freedom: an uncertainty is then known to 20 %
-_FEW_RUNS, _WIDE = 3.0, 4.0  # degrees of freedom of few runs; k twice that of many
+_FEW_RUNS, _WIDE = 3, 4.0  # most runs that are few; k twice that of many
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _ENOUGH_HELD_OUT = 16  # held-out values: with 16, fewer than 80 % in 95 % bands is a 1 % chance
 _MOST_WARNINGS = 5  # warnings shown; more would hide the verdict
@@ -391,14 +391,13 @@ def reading(fit: Any) -> Iterator[Finding]:
 
 def _few_runs(fit: Assessed) -> Iterator[Finding]:
     """Yield that intervals are wide because few runs show the scatter between them."""
-    if not fit.counts_sources:
+    if not fit.counts_sources or not 1 < fit.runs <= _FEW_RUNS:
         return
     with suppress(FitError):  # nothing is determined
         budgets = fit.budget().values()
-        dof = min((r.dof for b in budgets for r in b.rows if r.source == RUNS), default=np.inf)
-        k = max(b.k for b in budgets)
-        if dof < _FEW_RUNS and k > _WIDE:
-            yield assumed("few_runs", k=k, runs=1 + round(dof))
+        wide = [b.k for b in budgets if b.k > _WIDE >= b.k_without(RUNS, TESTS)]
+        if wide:
+            yield assumed("few_runs", k=max(wide), runs=fit.runs)
 
 
 def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:

@@ -331,12 +331,17 @@ class RecordAssessment(Assessment):
         ]
         return float(np.concatenate([f - f.mean() for f in force]).std() / size)
 
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.errors.runs
+
     def design(self, *, counted: bool) -> dict[str, Any]:
         """Return what the number of records assumes."""
         exponents = self.problem.exponents
         unseen = [p.name for p in exponents if p.assumed and p.name not in self.assumed]
         unfound = tuple(unseen) if counted and not self.first_order else ()
-        return {"single_run": self.errors.runs < 2, "unfound": unfound}
+        return {"single_run": self.runs < 2, "unfound": unfound}
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -335,7 +335,8 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "more_warnings": lambda count: f"{counted(count, 'more warning')} on reading.",
     "few_runs": lambda k, runs: (
         f"The scatter of {runs} runs has {counted(runs - 1, 'degree of freedom')}, so the coverage "
-        f"factor k is up to {k:.3g}; with another run, about {coverage_factor(runs):.2g}."
+        f"factor k is up to {k:.3g}"
+        + (f"; with another run, about {less:.2g}." if (less := coverage_factor(runs)) < k else ".")
     ),
     "assumed": _assumed,
 }
