@@ -39,6 +39,11 @@ DRIVEN = "frequency_hz,drive [N],gain [m/N],phase_deg\n" + "".join(
             "--target f_max",
             "give --time, or --target f_max=0.02",
         ),
+        (
+            "fit driven.csv --element dahl --element dahl",
+            "such as --element 'dahl(name=pivot)'",
+        ),
+        ("fit shaken.csv --record --predicted motion", "; add --mass free, or predict the force"),
         ("sample driven.csv --alpha free --mass free --method grid", "or use --method mcmc"),
     ],
 )
@@ -47,6 +52,7 @@ def test_messages_name_options(command, said, run):
     Path("waves.csv").write_text(WAVES)
     Path("moved.csv").write_text(WAVES.replace("x [mm]", "moved [mm]"))
     Path("driven.csv").write_text(DRIVEN)
+    Path("shaken.csv").write_text(WAVES.replace("pull", "force"))
     assert said in run.refused(*shlex.split(command))
 
 

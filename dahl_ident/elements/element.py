@@ -28,7 +28,7 @@ from dahl_ident.elements.force_law import ForceLaw, required_history
 from dahl_ident.elements.law_checks import check_declarations
 from dahl_ident.elements.law_module import LawFile, file_of, module_of, source_path
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.errors import ModelError, ValidationError, choices
+from dahl_ident.errors import ModelError, ValidationError, choices, spelled
 
 Value = TypeVar("Value")
 
@@ -242,7 +242,8 @@ class Model(Element):
         if clashes:
             raise ModelError(
                 f"two elements share the parameter names {', '.join(clashes)}; "
-                "give each a name, such as Dahl(name='pivot')"
+                "give each a name, such as "
+                + spelled("Dahl(name='pivot')", "--element 'dahl(name=pivot)'")
             )
         ends = np.cumsum([0, *(len(element.parameters) for element in flat)]).tolist()
         self._slices = [slice(a, b) for a, b in pairwise(ends)]

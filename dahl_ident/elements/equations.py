@@ -27,7 +27,7 @@ from dahl_ident.elements.law_checks import (
     short_repr,
     trial_values,
 )
-from dahl_ident.errors import ModelError
+from dahl_ident.errors import ModelError, spelled
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -81,7 +81,7 @@ def plant_equations(
                 "build it from Mass, Damper and Spring, or drive the plant by a force"
             )
     if not model.has_inertia:
-        has, remedy = "no mass", "add Mass()"
+        has, remedy = "no mass", f"add {spelled('Mass()', '--mass free')}"
         if any(p.is_mass for p in model.parameters):
             has, remedy = "a mass of 0", "give another, or leave it free"
         raise ModelError(

@@ -19,7 +19,7 @@ from dahl_ident.elements.driven_motion import Coefficients
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.elements.parameter import Dimension
-from dahl_ident.errors import DataError, ModelError, ValidationError, argument
+from dahl_ident.errors import DataError, ModelError, ValidationError, argument, spelled
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
 from dahl_ident.problem.space import Space
@@ -112,7 +112,8 @@ class RecordWaves(Problem):
         if self.output == "force" and record.displacement is None:
             raise DataError(
                 f"{which} has {record.motion_channel} but no displacement, from which the force "
-                "would follow; integrate it, or add Mass() to fit the motion"
+                f"would follow; integrate it, or add {spelled('Mass()', '--mass free')} to "
+                "fit the motion"
             )
         if self.output == "motion":
             _ = record.force_samples
@@ -130,7 +131,8 @@ class RecordWaves(Problem):
             why = "the base moves" if self.excitation == "base" else "the force is zero"
             raise DataError(
                 f"{why}, so that the motion determines only the ratios of masses, forces, dampers "
-                "and springs; give one of them, such as the mass: Mass(1.0), --mass 1.0"
+                "and springs; give one of them, such as the mass: "
+                f"{spelled('Mass(1.0)', '--mass 1.0')}"
             )
 
     @property
@@ -417,7 +419,7 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
     if count > 1:
         raise ModelError(
             f"several elements have an unknown called {name} in a fit of records; give each a "
-            "name, such as Dahl(name='pivot')"
+            "name, such as " + spelled("Dahl(name='pivot')", "--element 'dahl(name=pivot)'")
         )
     for p in model.parameters:
         if p.name in occurrences:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element, Model
-from dahl_ident.errors import DataError, ModelError
+from dahl_ident.errors import DataError, ModelError, spelled
 
 _GRID_STEP = 0.1  # of ln A; the slope of a curve changes by about 1 over a unit
 
@@ -99,6 +99,6 @@ def as_response(data: FrequencyResponse, model: Model) -> FrequencyResponse:
     if not masses or any(p.free for p in masses):
         raise ModelError(
             f"natural frequencies and damping ratios determine {model!r} up to the mass; give the "
-            "modal mass in it, such as Mass(0.5)"
+            f"modal mass in it, such as {spelled('Mass(0.5)', '--mass 0.5')}"
         )
     return data.with_mass(sum(float(p.value or 0.0) for p in masses))

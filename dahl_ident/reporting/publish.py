@@ -16,7 +16,7 @@ import numpy as np
 from dahl_ident.data import Record
 from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import make_folder, place_of, plain_data, refuse_existing, write_whole
-from dahl_ident.errors import ValidationError, argument
+from dahl_ident.errors import ValidationError, argument, spelled
 from dahl_ident.reporting.comparison import of_kind
 from dahl_ident.reporting.document import Document
 from dahl_ident.reporting.sections import Result, document
@@ -141,6 +141,7 @@ def _check(results: Sequence[object]) -> None:
 
 def _check_calibrations(results: Sequence[Result], stated: Metadata) -> None:
     """Refuse results that do not count the uncertainties which the instruments state."""
+    fit_with = spelled("sensors=Sensors.from_metadata(metadata)", "--metadata and this file")
     for name, u in stated.calibrations().items():
         for result in results:
             counted = result.problem.calibrations.get(name, 0.0)
@@ -148,8 +149,7 @@ def _check_calibrations(results: Sequence[Result], stated: Metadata) -> None:
                 taken = f"a standard uncertainty of {counted:.3g}" if counted else "it as exact"
                 raise ValidationError(
                     f"the instruments state a standard uncertainty of {u:.3g} for {name}, but the "
-                    f"fit takes {taken}; fit with --metadata and this file (in Python with "
-                    "Sensors.from_metadata), and report on that fit"
+                    f"fit takes {taken}; fit with {fit_with}, and report on that fit"
                 )
 
 
