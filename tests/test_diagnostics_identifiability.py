@@ -194,7 +194,7 @@ class TestVerdicts:
         found = identifiability(fit(table(n=1, beta=(1.0, 1.0)), Dahl()))
         assert found.named(NOT) == ["f_max", "sigma"]
         for parameter in found.parameters.values():
-            assert "because no number is left to estimate the noise by" in parameter.text
+            assert "because no residual is left from which to estimate the noise" in parameter.text
             assert "slip" not in parameter.text
 
     def test_copies_of_rows_tell_nothing_new(self):

@@ -259,7 +259,7 @@ class TestPlan:
         [
             ({"sample_rate": None}, "motions in time need sample_rate"),
             ({"sample_rate": 0.5}, "expected at least 10 samples in a trapezoid's move"),
-            ({"noise": 0.01}, "give that of a force sample alone"),
+            ({"noise": 0.01}, "give only the standard deviation of a force sample"),
             ({"noise": None}, "the noise of the force is unknown"),
             ({"candidates": "square"}, "one of trapezoid, multisine"),
             ({"candidates": [FEW[0], (1e-3, 1.0)]}, "holds motions and others"),

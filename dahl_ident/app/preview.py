@@ -57,9 +57,9 @@ def preview(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def _add_channels(file: str, result: dict[str, Any]) -> dict[str, Any]:
-    """Add the channels of a file, and return its column map, which is proposed at first.
+    """Add the channels of a file, and return its column map: the saved one, or a proposal.
 
-    Those of one name in struct arrays are one channel, as in a column map.
+    Channels of one name in an array of structs count as one channel, as in a column map.
     """
     source = open_source(file)
     found = contents(source)
@@ -122,7 +122,7 @@ def _picture(draw: Callable[[], Any]) -> str:
 
 
 def _hertz(text: str, what: str) -> float:
-    """Return a frequency in Hz; a number without a unit is one."""
+    """Return a frequency in Hz; a number without a unit is in Hz."""
     try:
         return float(text)
     except ValueError:
@@ -130,7 +130,7 @@ def _hertz(text: str, what: str) -> float:
 
 
 def _thumbnail(values: Any) -> list[list[float]]:
-    """Return a curve in the unit square; many samples are reduced to extremes of parts."""
+    """Return a curve in the unit square; many samples are reduced to the extremes of groups."""
     y = np.asarray(values, dtype=np.float64).ravel()
     y = y[np.isfinite(y)]
     if y.size < 2:

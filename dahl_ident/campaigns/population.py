@@ -125,8 +125,8 @@ class PopulationParameter:
         one fit.
     devices : DataFrame
         One row per device: the mean of its own fits (`own`), the estimate shrunk towards the
-        population (`shrunken`) with its standard uncertainty, and `p`, the probability of a device
-        this distant if it belongs to the population.
+        population (`shrunken`) with its standard uncertainty, and `p`, the probability that a
+        device of the population lies this far from the others.
     ordered : bool
         Whether an order in time was stated.
     fits : DataFrame
@@ -287,7 +287,7 @@ def population(
         its value ``p`` and its combined standard uncertainty ``u_p``.
     parameters : sequence of str, optional
         Parameters to evaluate; by default every column that has an uncertainty, except exponents
-        that nobody gave (column `assumed`): their estimates share a prior.
+        that the user did not give (column `assumed`): their estimates share a prior.
     covariates : sequence of str, optional
         Columns on which the parameters may depend linearly.
     order : str, optional
@@ -358,7 +358,7 @@ def fewest_devices(covariates: Sequence[str]) -> int:
 
 
 def with_final_status(table: pd.DataFrame, parameters: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return the table; the status of a usable fit without a finite uncertainty says so."""
+    """Return the table, in which usable fits without a finite uncertainty have another status."""
     names = _estimated(table) if parameters is None else parameters
     u = table[[f"u_{name}" for name in names]].replace(np.inf, np.nan)
     without = table["status"].isin(USABLE) & (u.isna().any(axis=1) | u.empty)
@@ -376,20 +376,20 @@ def _parameters(table: pd.DataFrame, names: Sequence[str] | None) -> list[str]:
 
 
 def _estimated(table: pd.DataFrame) -> list[str]:
-    """Return the parameters with an uncertainty, without assumed ones, which share their prior."""
+    """Return the parameters with an uncertainty; assumed ones are left out: they share a prior."""
     columns = [str(c) for c in table if f"u_{c}" in table]
     assumed = assumed_in(table)
     return [c for c in columns if not c.startswith("posterior_") and c not in assumed]
 
 
 def assumed_in(table: pd.DataFrame) -> set[str]:
-    """Return the parameters that nobody gave, and that a fit of the table has assumed."""
+    """Return the parameters that the user did not give, so that a fit of the table assumed them."""
     texts = table["assumed"].dropna().unique() if "assumed" in table else ()
     return {name for text in texts for name in text.split(" | ")}
 
 
 def unit_in(table: pd.DataFrame, name: str) -> str:
-    """Return the unit of a parameter; of a dimensionless one, and without a column, none."""
+    """Return the unit of a parameter; "" if it has none, or if the table does not state it."""
     units = table[f"unit_{name}"].dropna() if f"unit_{name}" in table else ()
     return next(map(str, units), "")
 
@@ -429,7 +429,7 @@ def _parameter_statistics(
     own = fits.sums(y / u**2) / fits.sums(u**-2)
     w = 1.0 / (omega[0] ** 2 + u**2)
     weight = fits.sums(w)
-    shrunken, variance = fits.sums(w * y) / weight, 1.0 / weight  # of outlying devices: not shrunk
+    shrunken, variance = fits.sums(w * y) / weight, 1.0 / weight  # outlying: not shrunk
     shrunken[~outlying], variance[~outlying] = posterior.devices, posterior.variance
     devices = pd.DataFrame({"own": own, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels)
     devices["p"], devices["outlying"] = p, outlying
@@ -507,7 +507,7 @@ def _reml(data: _Fits) -> tuple[float, float]:
     spread = float(np.sqrt(np.var(data.y) + data.u2.min()))
 
     def objective(x: FloatArray) -> float:
-        return -data.solve(*np.abs(x) * spread).log_likelihood  # even, so that zero is ordinary
+        return -data.solve(*np.abs(x) * spread).log_likelihood  # even: zero is no edge
 
     if len(data.y) == data.devices:
         best = optimize.minimize_scalar(
@@ -552,7 +552,7 @@ def _outlying(data: _Fits) -> tuple[FloatArray, BoolArray]:
         x = (w[:, None] * kept.X[fits]).sum(axis=0) / w.sum()
         deviation = float((w * kept.y[fits]).sum() / w.sum() - x @ solution.b)
         distance = deviation / np.sqrt(tau**2 + 1.0 / w.sum() + x @ solution.C @ x)
-        # the most distant of all: Sidak's correction for the number of devices
+        # Sidak's correction: the most distant of several devices is tested
         single = 2.0 * stats.t.sf(abs(distance), freedom)
         p[numbers[worst]] = -np.expm1(kept.devices * np.log1p(-min(single, 1.0 - 1e-16)))
         if p[numbers[worst]] >= _FALSE_ALARMS:
@@ -563,7 +563,7 @@ def _outlying(data: _Fits) -> tuple[FloatArray, BoolArray]:
 
 
 def _charts(y: FloatArray, device: IntArray, inside: BoolArray, ordered: bool) -> dict[str, Any]:
-    """Return control charts of fits; those `inside` the population set centre and limits.
+    """Return control charts of fits; those `inside` the population determine centre and limits.
 
     If devices have several fits, a value is the deviation from the mean of its device, enlarged to
     the variance of a single fit; the scatter is that of successive fits of one device.

@@ -131,7 +131,7 @@ class LoopMargins:
         return low, high
 
     def plot(self, ax: Any = None) -> tuple[Any, Any]:
-        """Draw gain and phase margin against amplitude, with bands where there are draws.
+        """Draw gain and phase margin against amplitude, with bands if there are draws.
 
         `ax` is a pair of Axes, for gain and phase, new ones by default; it is returned.
         """

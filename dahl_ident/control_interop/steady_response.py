@@ -5,9 +5,9 @@ not proportional to u_0, because its dynamic stiffness depends on A (Eqn. 53):
 
     A |Z(A, omega)| = u_0,    Z = L(omega) + N(A),    L = k - m omega^2 + j omega c + ...
 
-All motions are first those of this balance of fundamentals. Where the plant has an equation of
-motion each is then made exact. Where L is passive (Im L >= 0) and the laws allow it, the amplitude
-is unique. An undamped resonance (L = 0) driven with 4 f_max/pi or more has no steady amplitude.
+The motions first follow from this balance of fundamentals. If the plant has an equation of motion,
+each is then made exact. If L is passive (Im L >= 0) and the laws allow it, the amplitude is unique.
+An undamped resonance (L = 0) driven with 4 f_max/pi or more has no steady amplitude.
 """
 
 from __future__ import annotations
@@ -150,9 +150,9 @@ def response(
         (levels, 1).
     all_roots : bool, default False
         Return all amplitudes of each point, stable or not, along a last axis in rising order,
-        followed by NaN. Otherwise one: the stable motion that a sweep through the points in their
-        order follows, up to where it jumps; with the describing function the smallest. Only plants
-        with negative damping, or with laws such as Backlash, have several.
+        followed by NaN. By default one: that of the stable motion that a sweep through the points
+        in their order follows, up to where it jumps; with the describing function the smallest.
+        Only plants with negative damping, or with laws such as Backlash, have several.
     steady : {"exact", "describing function"}, default "exact"
         "exact" is the periodic solution of Eqn. 2 with all harmonics. The describing function
         assumes a sinusoidal displacement, A abs(Z(A, omega)) = u_0 (Eqn. 53); it is also used for
@@ -238,7 +238,7 @@ def response(
     drifts = bool(np.any(exact & (count.ravel() == 0))) and Shooting(plant).drifts(values)
     message = _message(count, drifts, active, unstable, f, u0)
     if steady == "exact" and not exact.all() and why != LINEAR:
-        replaced = f"the describing function stands for the exact motion ({why or 'at 0 Hz'})"
+        replaced = f"the describing function replaces the exact motion ({why or 'at 0 Hz'})"
         message = "; ".join(filter(None, (message, replaced)))
     if steady == "describing function" and not obstacle(plant):
         at = np.flatnonzero(moving & (count.ravel() == 1))
@@ -286,8 +286,8 @@ def _not_a_sine(plant: Model, omega: FloatArray, drive: FloatArray, A: FloatArra
         return ""
     row = int(np.nanargmax(third))
     return (
-        "the motion is not the sine for which the describing function takes it: the third harmonic "
-        f"is about {percent(third[row])} at {omega[row] / (2.0 * np.pi):g} Hz, drive "
+        "the motion is not a sine, as the describing function assumes: the third harmonic is about "
+        f"{percent(third[row])} at {omega[row] / (2.0 * np.pi):g} Hz, drive "
         f"{drive[row]:g}, and the fundamental may be off by several times as much; steady='exact' "
         "has no such error"
     )
@@ -323,7 +323,8 @@ def _message(
 ) -> str:
     """Return which points have no amplitude, several, or none that is stable, and why.
 
-    Empty if all have a stable one; at `active` points the linear part supplies energy.
+    Empty if every point has one amplitude, and it is stable. At `active` points the linear part
+    supplies energy.
     """
     why = (
         "friction differs between the directions, and no spring brings the motion back: it goes "
@@ -344,8 +345,8 @@ def _message(
         ),
         (
             unstable,
-            "no stable motion of the drive's period (a device moves otherwise there; leave such "
-            "points out of a fit)",
+            "no stable motion of the drive's period (there the device moves in another way; leave "
+            "such points out of a fit)",
         ),
     )
     parts = []

@@ -18,7 +18,7 @@ from dahl_ident.units import engineering, polar_std, si_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-_SAME_FREQUENCY = 5e-3  # largest relative difference of frequencies that are one
+_SAME_FREQUENCY = 5e-3  # largest relative difference of frequencies that count as equal
 _NOMINAL = 1.5  # factor within which a numeric level is the controlled amplitude
 
 
@@ -106,7 +106,7 @@ def held_amplitude(data: Table) -> FloatArray:
 
 
 def held_label(data: Table) -> str:
-    """Return the axis label of that amplitude."""
+    """Return the axis label of the controlled amplitude."""
     kind = _held_kind(data)
     return f"{kind} amplitude [{si_unit(kind, data.motion)}]"
 

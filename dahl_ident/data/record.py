@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DriveUnit = Literal["N", "N m", "V", "A"]
-_GAP = 1.5  # median steps; a longer step misses a sample
+_GAP = 1.5  # median steps; in a longer step a sample is missing
 _SMALLEST_VALUE = SMALLEST**0.5  # products and ratios of such numbers have representable squares
 _LONG_GAP = 5.0  # median steps; a longer gap is not interpolated
 _MOST_GAPS = 0.02  # fraction of the samples; with more gaps the record has uneven steps
@@ -210,7 +210,7 @@ class Record(Tabular):
         Raises
         ------
         ValidationError
-            If `kind` is another one, or `ax` holds another number of axes than there are channels.
+            If `kind` is unknown, or `ax` does not hold one of the axes for each channel.
 
         Examples
         --------
@@ -317,7 +317,7 @@ def unbroken(record: Record, shortest: int) -> list[Record]:
 
 
 def at_even_times(record: Record) -> Record:
-    """Return a record at even times, and warn if it is resampled, by cubic splines."""
+    """Return a record with even steps, and warn if cubic splines resample it."""
     time = record.time
     if time.size <= 3 or record.uniform:
         return record

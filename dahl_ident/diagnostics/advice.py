@@ -38,8 +38,8 @@ def advice(optimum: Optimum, name: str, limits: Interval, lost: frozenset[str]) 
     """
     if not optimum.scale_known and optimum.dof <= 0:
         return (
-            "because no number is left to estimate the noise by: measure more points, or repeat "
-            "them so that their covariance is known"
+            "because no residual is left from which to estimate the noise: measure more points, or "
+            "repeat them so that their covariance is known"
         )
     gain = _confounding_gain(optimum, name, lost)
     if gain:
@@ -75,6 +75,7 @@ def _confounding_gain(optimum: Optimum, name: str, lost: frozenset[str]) -> str:
 def _friction_advice(
     optimum: Optimum, element: Element, parameter: Parameter, limits: Interval, lost: frozenset[str]
 ) -> str:
+    """Return the advice on a parameter of friction."""
     label, dimension = element.label(parameter), parameter.dimension
     scales = label in element.scale_parameters
     amplitude = optimum.problem.stiffness_data.amplitude
@@ -103,21 +104,21 @@ def _friction_advice(
     parallel = f" in parallel with the free {spring}" if spring else ""
     fix = f", or measure the spring and fix {spring}" if spring else ""
     share = f"friction's share of the response from {least} to {most}"
-    no_most = np.isinf(limits.upper)
+    unbounded = np.isinf(limits.upper)
     sticks = amplitude.max() < low
     is_limit, is_stiffness = scales and dimension == FORCE, scales and dimension == STIFFNESS
     limit_lost = any(p.name in lost for p in _scaled(element, FORCE))
-    if spring and limits.lower <= 0.0 and no_most and limit_lost:
+    if spring and limits.lower <= 0.0 and unbounded and limit_lost:
         reason = f"{share},{parallel}, is within the noise"
         remedy = "cover amplitudes where it is larger, reduce the noise"
-    elif is_limit and no_most:
+    elif is_limit and unbounded:
         hidden = f"the free {spring} hides it below {most}"
         reason = hidden if spring else f"no amplitude up to {most} reaches slip"
         remedy = "drive above that"
     elif is_stiffness and spring and (spring in lost or sticks):
         reason = f"the free {spring} can take its place"
         remedy = "drive far into slip"
-    elif is_stiffness and no_most and not limit_lost:
+    elif is_stiffness and unbounded and not limit_lost:
         reason = f"every amplitude from {least} slips and friction's stiffness fades{parallel}"
         remedy = "drive below that"
     elif spring:
@@ -136,6 +137,7 @@ def _scaled(element: Element, dimension: Dimension) -> list[Parameter]:
 
 
 def _spring_advice(optimum: Optimum, lost: frozenset[str]) -> str:
+    """Return the advice on the stiffness of a spring in parallel with friction."""
     friction = (e for e in optimum.problem.model.elements if e.has_memory)
     stiff = [p.name for e in friction for p in _scaled(e, STIFFNESS) if p.name in lost]
     if stiff:

@@ -140,9 +140,9 @@ class ComparedModel:
     def meaning(self) -> dict[str, float]:
         """Quantities common to all laws: force limit, stiffness at zero force, energies.
 
-        Of all elements with memory together: N, N/m, and joules lost in a cycle at the smallest,
-        the middle and the largest amplitude, of records at their rms displacements. Infinite where
-        a law never slips, NaN where these data do not determine it.
+        They are those of all elements with memory together: N, N/m, and joules lost in a cycle at
+        the smallest, the middle and the largest amplitude; of records, at their rms displacements.
+        Infinite if a law never slips, NaN if these data do not determine them.
         """
         problem = self.optimum.problem
         quantities = friction_quantities(problem, parameter_values(self.optimum))
@@ -199,7 +199,7 @@ class ModelComparison:
 
     @cached_property
     def undetermined(self) -> ComparedModel | None:
-        """A physical model that the data do not determine, of far smaller misfit than the best."""
+        """A physical model with far less misfit than the best, which the data do not determine."""
         best = self._simplest
         physical = [model for model in self.models if model.is_physical or model is best]
         likeliest = max(physical, key=lambda model: model.density.total)
@@ -209,10 +209,10 @@ class ModelComparison:
 
     @cached_property
     def undecided(self) -> tuple[ComparedModel, ...]:
-        """The simplest of models that these data do not distinguish, and one that differs.
+        """The simplest of the models that these data do not distinguish, and one that disagrees.
 
-        The latter is the likeliest whose force limit or stiffness at zero force is different. Empty
-        where there is none, or where the simplest is the one that was fitted.
+        The second is the likeliest with another force limit or stiffness at zero force. Empty if
+        there is none, or if the simplest is the model that was fitted.
         """
         best = self._simplest
         others = [m for m in self._alike if m is not self.models[0] and _disagreement(best, m)]
@@ -347,7 +347,7 @@ def _levels(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str]:
-    """Return which quantities are not determined, by the first-order error of their logarithms."""
+    """Return the quantities whose logarithm has too large an error, to first order."""
     names, theta = OF_FRICTION, optimum.theta
     if not optimum.converged:
         return list(names)
@@ -366,7 +366,7 @@ def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str
 
 
 def _disagreement(first: ComparedModel, second: ComparedModel) -> str:
-    """Return the quantity of friction on which two models disagree; "" where they agree."""
+    """Return the quantity of friction on which two models disagree; "" if they agree."""
     for key in OF_FRICTION:
         a, b = first.meaning[key], second.meaning[key]
         if abs(a - b) > _DISAGREE * max(a, b):
@@ -403,14 +403,14 @@ def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> Mod
     Parameters
     ----------
     fit : FitResult
-        From :func:`dahl_ident.fit`; its data, noise model, sensors and loss are used for all.
-        Of records, blocks of samples are left out, and each candidate is a search of its own.
+        From :func:`dahl_ident.fit`; its data, noise model, sensors and loss are used for all. If
+        it is a fit of records, blocks of samples are left out, and each model takes a search.
     models : mapping of str to Element, optional
-        Models to compare with, by a name for each. Left out: for a Dahl element another exponent,
-        two elements, two limits (where even harmonics are given), a gap, Bouc-Wen's and Iwan's
-        law, LuGre's where the force falls with the frequency, Maxwell slip where parallel Jenkins
-        elements would leave much less; a spring and a power damper added and, where the frequency
-        changes, a mass and a damper.
+        Models to compare with, by name. By default, in place of a Dahl element: another exponent,
+        two elements, two limits (if there are even harmonics), a gap, Bouc-Wen's and Iwan's law,
+        LuGre's if the force falls with the frequency, Maxwell slip if parallel Jenkins elements
+        would leave much less; and in addition to it: a spring, a power damper and, if the frequency
+        changes, a mass or a damper.
 
     Returns
     -------
@@ -505,11 +505,10 @@ def _candidates(
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
         alternatives = [offered[name] for _, offered in offers if name in offered]
         reason = next((reasons[a.shows] for a in alternatives if a.shows != "shape"), misfit)
-        # an assumed exponent is estimated anyway; several elements in place of each of two would
-        # share their names
-        estimated = name == "exponent free" and exponent_is_assumed
+        is_fitted = name == "exponent free" and exponent_is_assumed
+        # two elements that are both replaced by several would have parameters of the same names
         named_twice = len(alternatives) > 1 and any(len(a.elements) > 1 for a in alternatives)
-        if reason and not estimated and not named_twice:
+        if reason and not is_fitted and not named_twice:
             yield (
                 name,
                 reason,
@@ -539,7 +538,7 @@ def _candidates(
 
 
 def _even(optimum: Optimum) -> str:
-    """Return how large mean force and even harmonics are, or "" where there are none."""
+    """Return how large the mean force or the even harmonics are; "" if there are none."""
     data = optimum.problem.data
     size = np.sqrt(np.mean(np.abs(data.response[data.harmonic == 1]) ** 2))
     for name, rows in (
@@ -554,10 +553,10 @@ def _even(optimum: Optimum) -> str:
 
 
 def _falling_force(optimum: Optimum) -> str:
-    """Return how much abs(N) falls with the frequency against the model's; "" where it does not.
+    """Return how far abs(N) over that of the model falls with the frequency; "" if it does not.
 
-    A straight line over ln f is fitted, whose slope is a parabola in ln A, in addition to any
-    smooth dependence on the amplitude.
+    A straight line over ln f is fitted, whose slope is a parabola in ln A, in addition to a smooth
+    dependence on the amplitude.
     """
     problem = optimum.problem
     view, fitted = problem.stiffness_data, problem.predicted_stiffness(optimum.theta).stiffness

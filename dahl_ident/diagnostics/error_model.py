@@ -78,9 +78,9 @@ _FEWEST_TESTS = 5  # of which each is left out in turn
 _MOST_REFITS = 20  # tests; if there are more, none changes the weights much by being left out
 _FALSE_ALARM = 0.01  # share of sound tables whose stated noise is doubted
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
-_SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
+_SHARED_BY = 4.0  # most tests that a smooth model error changes alike: its correlation length
 _UPPER = 0.5 * (1.0 + CONFIDENCE)
-_KINDS = 2  # of model error that were looked for, of which the more likely one counts
+_KINDS = 2  # kinds of model error that are tried; the likelier one counts
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
 _DETERMINED = 1e-10  # least singular value of derivatives, of the largest, that is not rounding
 _AS_STATED = 1e-6  # relative rise of the noise's variance up to which it is as stated
@@ -123,7 +123,7 @@ class ErrorModel(ErrorContributions):
 
     @property
     def noises(self) -> FloatArray:
-        """Variance of the noise over that by which rows count: fundamentals, then harmonics."""
+        """Variance of the noise over that of the weights: of fundamentals, then of harmonics."""
         return self.state.sizes[: self.state.model.noises]
 
     @property
@@ -140,7 +140,7 @@ class ErrorModel(ErrorContributions):
 
     @cached_property
     def estimates(self) -> Mapping[str, float]:
-        """The same, with the limits at which the optimum lies, zero or infinite."""
+        """The estimates by name; zero or infinite if the optimum lies at such a limit."""
         at_optimum = zip(self.optimum.names, self.optimum.values.tolist(), strict=True)
         return {**self.values, **{n: v for n, v in at_optimum if v == 0.0 or np.isinf(v)}}
 
@@ -152,7 +152,7 @@ class ErrorModel(ErrorContributions):
         return dict(zip(self.names, errors.tolist(), strict=True))
 
     def holds(self, name: str) -> bool:
-        """Return whether a parameter is determined, where the data leave some directions open."""
+        """Return whether the data determine a parameter."""
         if not np.isfinite(self.optimum.stderr.get(name, 0.0)):
             return False  # at the limit at which the optimum lies
         return bool(self.estimate.basis.holds(np.eye(len(self.names))[self.names.index(name)]))
@@ -161,10 +161,10 @@ class ErrorModel(ErrorContributions):
     def dof(self, direction: FloatArray, source: str | None = None) -> float:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
 
-        Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
-        less than 1; fewer where the interval would be narrower than that of the runs alone.
-        `source` leaves only this one; infinite where all variances are known. What an assumed
-        exponent adds depends on the variances as well.
+        Satterthwaite's: 2 u^4 over the variance of u^2 due to the errors of the variances, at
+        least 1; fewer if the interval would be narrower than that of the runs alone. Infinite if
+        all variances are known. With `source`, the uncertainty is from this source alone. What an
+        assumed exponent adds depends on the variances as well.
         """
         direction = direction / (float(np.abs(direction).max()) or 1.0)  # any length will do
         slopes, exact = np.einsum("i,ekij,j->ek", direction, self.units, direction)
@@ -222,7 +222,7 @@ class ErrorModel(ErrorContributions):
 
     @cached_property
     def runs(self) -> RunDeviations | None:
-        """How runs deviate from the generalised estimate; None where none scatters."""
+        """How runs deviate from the generalised estimate; None if they do not scatter."""
         shown = [k for k, source in enumerate(self.sources) if source.name == RUNS]
         if not shown:
             return None
@@ -239,16 +239,17 @@ class ErrorModel(ErrorContributions):
 
     @cached_property
     def within_runs(self) -> ComplexArray:
-        """Responses (n,), each run's by its own parameters, gain and phase."""
+        """Predicted responses, (n,), with the parameters, gain and phase of each run."""
         if self.runs is None:
             return self.estimate.predicted
         return Linearization(self.problem, self.theta, self.runs).fitted
 
     @cached_property
     def parallel_to_the_law(self) -> ComplexArray:
-        """Responses (n,) by generalised least squares, with forces, rates and errors of levels.
+        """Predicted responses, (n,), with errors of levels and model errors in parallel to the law.
 
-        Without the smooth departure from the law itself, which its parameters do not describe.
+        They are predicted by generalised least squares, without the smooth departure from the law
+        itself, which its parameters do not describe.
         """
         model, effects = self.state.model, self.state.predicted.copy()
         for k, source in enumerate(self.sources):
@@ -271,7 +272,7 @@ class ErrorModel(ErrorContributions):
 
     @cached_property
     def structure_by_chance(self) -> float:
-        """Probability that noise, and what groups of rows share, alone make it as large."""
+        """Probability that noise and errors of groups of rows alone make `structure` as large."""
         of_model = [k for k, source in enumerate(self.sources) if source.name == MODEL_ERROR]
         if not of_model:
             return 1.0
@@ -285,7 +286,7 @@ class ErrorModel(ErrorContributions):
         return min(1.0, _KINDS * min(alone.chance_of(k, known=known) for k in of_model))
 
     def rms(self, name: str) -> float:
-        """Return the rms of ln gain and phase by one source, or by noise beyond the stated one.
+        """Return the rms of ln gain and phase due to a source, or to noise in excess of the stated.
 
         Of the differences between runs, those of gain and phase count.
         """
@@ -298,17 +299,18 @@ class ErrorModel(ErrorContributions):
 
     @cached_property
     def noise_square(self) -> float:
-        """Mean square of ln gain and phase of the fundamentals, by residuals of unit variance."""
+        """Mean square of the fundamentals' ln gain and phase for residuals of unit variance."""
         first = self.problem.data.harmonic == 1
         units = self.estimate.relative_units[first if first.any() else slice(None)]
         return 0.5 * float(np.mean(np.sum(units**2, axis=(1, 2))))
 
 
 def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorModel | None:
-    """Return the model of an optimum's errors; None where there is nothing to estimate it from.
+    """Return the model of an optimum's errors, or None.
 
-    That is residuals that are rounding errors, or an undetermined parameter; `of_combinations`:
-    then the covariance holds for what the data determine, and for that alone.
+    None if the residuals are rounding errors or too few, or a parameter is undetermined. With
+    `of_combinations` parameters may be undetermined; the covariance then only holds for what the
+    data determine.
     """
     if optimum.is_exact or not np.isfinite(optimum.theta).all():
         return None
@@ -401,9 +403,9 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
 
 
 def _standing_apart(optimum: Optimum) -> list[int]:
-    """Return the rows that stand apart.
+    """Return the suspicious rows; none if they are neighbours, or one at an end of a range.
 
-    Neighbours, or a row at an end of the table, may be where the model fails.
+    There the model may be wrong, and not the rows.
     """
     rows = sorted(p.row for p in suspicious_points(optimum, ResidualSpace(optimum)))
     return [] if is_at_end(optimum, rows) or neighbourhood(optimum, rows) else rows
@@ -428,7 +430,7 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
 
 
 def _unit_covariances(lever: FloatArray, state: MixedState) -> FloatArray:
-    """Return the estimate's covariances by noises, sources, priors of unit size: (k, Q, Q)."""
+    """Return the estimate's covariances from unit noises, sources and priors, (k, Q, Q)."""
     model, G = state.model, state.model.noises
     moved = lever @ model.U
     columns = [lever[:, model.group == g] for g in range(G)]

@@ -7,8 +7,8 @@ model's. Their joint false-alarm rate is 1 %: the level of each test is 1 % divi
 tests with at least its p-value (Holm, Scandinavian Journal of Statistics 6 (1979) 65).
 The noise that trends have to exceed includes the misfit of the estimate.
 
-Where the model does not describe the data, the sign of the response and the suspicious rows are
-tried as causes (:mod:`dahl_ident.diagnostics.misfit_explanations`); a cause leads the verdict.
+If the model does not describe the data, the sign of the response and the suspicious rows are tried
+as causes (:mod:`dahl_ident.diagnostics.misfit_explanations`); the verdict begins with the cause.
 
 A fit may agree with the data and still be physically impossible; this gives a warning
 (:mod:`dahl_ident.diagnostics.physics`).
@@ -78,17 +78,17 @@ class Goodness:
     (True, 0.014, ())
     """
 
-    # root mean square of abs(measured - fitted)/abs(measured), of fundamentals where there are any;
+    # root mean square of abs(measured - fitted)/abs(measured), of fundamentals if there are any;
     # of records, of the residuals over that of the measured output's variation
     rms_misfit: float
     warnings: tuple[str, ...] = ()  # what is impossible or unsafe, and is not a finding
     flagged: tuple[str, ...] = ()  # rows that the extraction flagged, with the reason
-    # every test that applies; where the scatter between runs exceeds the noise, those within runs
+    # every test that applies; within runs, if the scatter between runs exceeds the noise
     tests: tuple[ResidualTest, ...] = ()
-    # estimated noise over the size of the response; None where the noise's scale is known
+    # estimated noise over the size of the response; None if the noise's scale is known
     noise_share: float | None = None
     dof: int = 0
-    # scatter about the fit over that of the data's own covariance, where the fit left that unused
+    # scatter about the fit over that of the data's covariance, if the fit did not use it
     scatter: float | None = None
     suspicious: tuple[SuspiciousPoint, ...] = ()  # points that stand apart
     # whether the amplitudes give no more numbers than friction has free parameters, so that any
@@ -102,7 +102,7 @@ class Goodness:
     # where the suspicious rows lie, if they alone depart from the model but are neighbours; for a
     # robust fit also if a single one is at an end
     neighbours: str = ""
-    # least misfit of parallel Jenkins elements, where it helps to explain a misfit
+    # least misfit of parallel Jenkins elements, if it helps to explain a misfit
     bound: float | None = None
 
     @cached_property
@@ -232,7 +232,7 @@ class Goodness:
 
     @property
     def cause(self) -> str:
-        """The reason why the data are not described, in words; empty where none is known."""
+        """The reason why the model does not describe the data, in words; "" if none is known."""
         causes = (f for f in self.findings() if f.code in ("sign", "rows_apart"))
         return next(map(str, causes), "")
 
@@ -315,7 +315,7 @@ def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
 
 
 def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
-    """Return in words where suspicious rows are neighbours, or one at an end; otherwise ""."""
+    """Return a clause if suspicious rows are neighbours, or if one alone is at an end, or ""."""
     rows = [point.row for point in tested.suspicious]
     if is_at_end(optimum, rows):
         return "it is the first or the last"
@@ -324,10 +324,10 @@ def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
 
 
 def _within_runs(errors: ErrorModel) -> Goodness | None:
-    """Return the tests of the residuals within runs; None where the runs do not differ.
+    """Return the tests of the residuals within runs; None if the runs do not differ.
 
-    Where differences between runs use half of the degrees of freedom, as with one point a run,
-    they cannot be distinguished from a wrong model, for which the plain residuals are tested.
+    If differences between runs use half of the degrees of freedom, as with one point a run, they
+    cannot be distinguished from a wrong model, for which the plain residuals are tested.
     """
     runs, optimum = errors.runs, errors.at_estimate
     if runs is None:
@@ -358,10 +358,7 @@ def _within_runs(errors: ErrorModel) -> Goodness | None:
 def _tested(
     optimum: Optimum, errors: ErrorModel | None, within: ResidualSpace | None = None
 ) -> Goodness:
-    """Return every test of the residuals at the estimate, and physical warnings.
-
-    The noise that trends have to exceed includes the estimate's misfit.
-    """
+    """Return every test of the residuals at the estimate, and physical warnings."""
     if errors is not None:
         optimum = errors.at_estimate
     space, problem = within or ResidualSpace(optimum), optimum.problem
@@ -425,9 +422,9 @@ def _chi_square(optimum: Optimum, space: ResidualSpace) -> ResidualTest | None:
 
 
 def _noise_share(optimum: Optimum) -> float | None:
-    """Return the estimated noise over the size of the response, 0 where it is rounding.
+    """Return the estimated noise over the size of the response; 0 if it is rounding.
 
-    It is that of most rows, where a few depart far.
+    A few rows that depart far do not raise it.
     """
     if optimum.scale_known:
         return None
@@ -454,7 +451,7 @@ def _exponent(
 ) -> ResidualTest | None:
     """Return the score test of the exponent that the only friction law holds fixed.
 
-    `widened` is the factor of `stderr` where the data scatter more than their covariance states.
+    `widened` is the factor by which `stderr` is larger if chi-square shows a misfit.
     """
     elements = [e for e in optimum.problem.model.elements if not e.is_linear]
     exponents = [p for e in elements for p in e.parameters if p.is_exponent]
@@ -486,9 +483,9 @@ def _exponent(
 
 
 def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ResidualTest | None:
-    """Return the third harmonic of the data over the model's, 1 for agreement.
+    """Return the test of the third harmonic: the size of the data's over the model's.
 
-    The p-value also sees wrong phases.
+    The p-value accounts for the phase as well.
     """
     rows = optimum.problem.data.harmonic == 3
     if not rows.any():

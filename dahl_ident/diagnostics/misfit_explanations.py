@@ -121,7 +121,7 @@ def _most_deviant(
 
 
 def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
-    """Return the fall of the sum of squares without each point: r' (I - H)^-1 r."""
+    """Return how far the sum of squares falls without each point: r' (I - H)^-1 r."""
     pairs = r.reshape(-1, 2, 1)
     Q = lever.reshape(len(pairs), 2, -1)
     left = np.eye(2) - Q @ Q.swapaxes(1, 2)
@@ -187,8 +187,8 @@ def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimu
     """Return in words which sign convention explains the misfit; "" if none does.
 
     `before` is the misfit of the estimate, and `misfit_of` returns that of another optimum, which
-    is infinite where tests object to it: a change of sign may also lower the misfit due to a
-    missing mass or spring, but not to the noise.
+    is infinite if tests object to it: a change of sign may also reduce the misfit due to a missing
+    mass or spring, but not down to the noise.
     """
     fitted = optimum.problem.predict(optimum.theta)
     middle = float(np.median(_misfit(optimum.problem, fitted)))
@@ -219,9 +219,9 @@ def _with_changed_sign(what: str, before: float, after: float, check: str) -> st
 
 
 def force_convention(optimum: Optimum, before: float) -> str:
-    """Return in words that the force of records has the wrong sign; "" if that is not the misfit.
+    """Return a sentence if the wrong sign of the records' force explains the misfit, or "".
 
-    Only where the force takes energy out of the mechanism the opposite sign is fitted.
+    The opposite sign is only fitted if the force takes energy out of the mechanism.
     """
     problem: RecordProblem = optimum.problem
     if problem.excitation == "base" or _work(problem) >= 0.0:
@@ -250,7 +250,7 @@ def _work(problem: RecordProblem) -> float:
 
 
 def refitted_without(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
-    """Return the optimum without some rows; None where there is none."""
+    """Return the optimum without some rows; None if there is none."""
     data = optimum.problem.data
     kept = ~np.isin(np.arange(data.n), rows)
     try:

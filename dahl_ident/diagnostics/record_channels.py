@@ -46,12 +46,12 @@ WINDOW = "window of differentiation"
 def motion_sources(
     fit: LinearFit, noisier: Sequence[Waves], other_motions: Mapping[str, Waves]
 ) -> Iterator[tuple[str, FloatArray]]:
-    """Yield what errors of the motion contribute, where they widen an interval of the model's.
+    """Yield the contributions of errors of the motion that widen the interval of a parameter.
 
-    Noise in a measured displacement counts as far as it shifts the estimate, which the changes of
-    the outputs by `noisier` displacements show; where the residuals show larger errors of the
-    displacement at turning points, what these shift beyond that; and so do the changes of the
-    outputs by `other_motions`.
+    Noise in a measured displacement contributes the shift of the estimate by the changes of the
+    outputs with `noisier` displacements. If the residuals show larger errors of the displacement at
+    turning points, these contribute what exceeds that shift. The changes of the outputs with
+    `other_motions` contribute the shifts that they cause.
     """
     problem = fit.problem
     with suppress(FitError):  # no motion next to the estimate
@@ -69,7 +69,7 @@ def motion_sources(
 
 
 def by_other_motions(fit: LinearFit) -> dict[str, Waves]:
-    """Return how the outputs change with motions that may as well be right, by source.
+    """Return the changes of the outputs with motions that are as likely, by source.
 
     The sources are turning points between samples, and the window of differentiation.
     """
@@ -84,10 +84,10 @@ def by_other_motions(fit: LinearFit) -> dict[str, Waves]:
 
 
 def with_noisier_displacement(fit: LinearFit) -> list[Waves]:
-    """Return how the outputs change with noisier displacements; their squares add up.
+    """Return the changes of the outputs with noisier displacements; their squares add up.
 
-    As much noise again is added, in several draws; or, with a dead band, the changes are those from
-    one end of where in it the true displacement may be to the other.
+    The same amount of noise is added once more, in several draws. With a dead band, there is one
+    change: half of that between the ends of the range in which the true displacement may lie.
     """
     problem = fit.problem
     if problem.output != "force":
@@ -127,10 +127,10 @@ def _squared(change: FloatArray) -> FloatArray:
 
 
 def by_calibration(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
-    """Yield what stated calibrations of the gains contribute.
+    """Yield the contributions of stated calibrations of the gains.
 
-    A gain changes the units of force or of displacement, and every parameter with them, if all are
-    estimated; known ones stay, which changes the others as if the known ones were wrong.
+    A gain changes the unit of force or of displacement, and every parameter with it if all are
+    estimated. Known parameters keep their values; the others change as if these were wrong.
     """
     problem = fit.problem
     for place, name in enumerate(("force_gain", "displacement_gain")):
@@ -160,13 +160,13 @@ def _by_gain(fit: LinearFit, place: int) -> FloatArray:
 
 
 def by_drive(fit: LinearFit) -> FloatArray | None:
-    """Return what noise in a measured drive contributes; None where it cannot be estimated.
+    """Return the contribution of noise in a measured drive; None if it cannot be estimated.
 
     It moves the plant most where it resonates or where friction slips, and parameters are
-    determined at these places. The covariance by noise takes the residuals as equally large
+    determined at these places. The covariance by noise assumes that the residuals are equally large
     everywhere, so it includes only a part of such noise. In addition, prediction and derivatives
-    have errors in common, which shifts the estimate (errors in variables): by as much as the same
-    noise once more would shift it. Draws of the noise give all three.
+    have errors in common, which shift the estimate (errors in variables) by as much as the same
+    noise once more would shift it. All three follow from draws of the noise.
     """
     problem, known = fit.problem, fit.by_noise[0]
     stds = drive_noise([record.force_samples for record in problem.records])
@@ -201,8 +201,8 @@ def by_drive(fit: LinearFit) -> FloatArray | None:
 def _beyond_samples(problem: RecordProblem) -> tuple[tuple[FloatArray, ...], ...]:
     """Return the motions with the turning points that lie between samples.
 
-    The motion is taken to turn at a sample. By how much it went farther follows from the parabola
-    through three samples, unless noise bends it as much.
+    The samples show a turn at one of them. How much farther the motion went follows from the
+    parabola through three samples, unless noise may bend it as much.
     """
     least = _BENT * problem.estimated_noise
     motions = []
@@ -220,11 +220,11 @@ def _beyond_samples(problem: RecordProblem) -> tuple[tuple[FloatArray, ...], ...
 
 
 def _at_turns(fit: LinearFit) -> FloatArray:
-    """Return the covariance (P, P) of an estimate by errors of displacements at turning points.
+    """Return the covariance, (P, P), due to errors of the displacement at turning points.
 
     Their variance is the excess of the residuals, in the directions of such errors, over what their
     mean spectrum explains; as it cannot be negative, it is the mean of a normal distribution cut
-    off at zero. It is at most ten times what noise the displacement's differences show.
+    off at zero. They are at most ten times as large as the noise that differences show.
     """
     excess, strength, scatter = 0.0, 0.0, 0.0
     moved = np.zeros(fit.inverse.shape)
@@ -290,7 +290,7 @@ def _patterns(fit: LinearFit, number: int) -> tuple[FloatArray, IntArray, int]:
 
 
 def _between(pattern: FloatArray, first: IntArray, covariance: FloatArray) -> FloatArray:
-    """Return the covariances of the patterns' products with noise of such autocovariances."""
+    """Return the covariances of the patterns' products with noise of these autocovariances."""
     ends = np.append(first[1:], pattern.size)
     size = np.abs(pattern)
     windows = []

@@ -344,7 +344,7 @@ def record_errors(
 def errors_on_constraints(
     optimum: Optimum, jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]
 ) -> RecordErrors:
-    """Return the errors of an estimate on constraints, from noise alone.
+    """Return the errors of an estimate under constraints, from noise alone.
 
     The optimum's covariance spans the directions that the constraints allow, in which the
     correlation of the residuals is accounted for.

@@ -256,8 +256,8 @@ def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float,
 def by_delay(fit: LinearFit) -> FloatArray:
     """Return the covariance of the estimate due to the delay.
 
-    The estimated delay has been removed, unless it is too long for that. The prior of the rest has
-    the problem's `delay_std`, which is widened unless the user stated it.
+    The estimated delay has been removed, unless it is too long for that. The prior of the
+    remaining delay has the problem's `delay_std`, which is widened unless the user stated it.
     """
     unit, stated = fit.problem.delay_std, "delay" in fit.problem.calibration
     freed = _FreedValue.of(fit, [unit * slope for slope in fit.delay_slopes])
@@ -394,10 +394,10 @@ def sandwich(
     Returns
     -------
     covariance : ndarray, shape (P, P)
-        Infinite variances where a parameter has no effect, or none of its own.
+        Infinite variances of parameters without an effect, or without one of their own.
     effective : float
-        Samples, divided by the mean ratio of a parameter's variance to what it would be if the
-        residuals were not correlated; at most all of them.
+        The number of samples, divided by the mean ratio of a parameter's variance to its variance
+        with uncorrelated residuals; at most the number of samples.
 
     Examples
     --------
@@ -452,10 +452,10 @@ def autoregression(
     Parameters
     ----------
     residual : ndarray, shape (n,)
-        Of mean zero, nearly.
+        Its mean is nearly zero.
     jacobian : ndarray, shape (n, P), optional
-        Of the fit with these residuals. A fit explains a part of the noise, most of slow noise;
-        the autocovariances are corrected for that part.
+        Of the fit with these residuals. A fit explains a part of the noise, and most of it if it
+        is slow; the autocovariances are corrected for that part.
 
     Returns
     -------
@@ -504,11 +504,11 @@ def _chosen(covariance: FloatArray, n: int) -> tuple[FloatArray, float]:
 def _explained_by_fit(
     basis: FloatArray, model: tuple[FloatArray, float], highest: int
 ) -> FloatArray:
-    """Return the fall of the mean autocovariances of such noise by a projection.
+    """Return how far a fit reduces the mean autocovariances of noise with this model.
 
     With Q an orthonormal basis of what was fitted, R the noise's covariance matrix and S_k the
-    shift by k: (2 tr(Q' R S_k Q) - tr(Q' S_k Q Q' R Q))/n, with the symmetric part of S_k; for all
-    shifts at once by Fourier transforms.
+    symmetric part of a shift by k, it is (2 tr(Q' R S_k Q) - tr(Q' S_k Q Q' R Q))/n. Fourier
+    transforms give it for all shifts at once.
     """
     n = basis.shape[0]
     m = fft.next_fast_len(2 * n, real=True)

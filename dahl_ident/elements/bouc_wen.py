@@ -161,14 +161,14 @@ class BoucWen(Friction):
         return (Asymptote("runs_away", "one that unloads at once", pinned, None, {"p": np.inf}),)
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return sigma/q for both directions where the force saturates, inf where it does not."""
+        """Return sigma/q for both directions if the force saturates, inf if it does not."""
         sigma, q, *_ = np.broadcast_arrays(*values)
         limit = np.full(np.shape(q), np.inf)
         limit = np.asarray(np.divide(sigma, q, out=limit, where=q > 0.0))
         return limit, limit
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return 8 sigma/pi and 4/pi sigma/q where the force saturates, inf where it does not.
+        """Return 8 sigma/pi and 4/pi sigma/q if the force saturates, inf if it does not.
 
         The peak force is loaded over at most 2 A, and a fundamental is at most 4/pi of the peak.
         """

@@ -151,7 +151,7 @@ class FirstState:
 def symbolic_mechanics(
     element: Element, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
 ) -> Mechanics:
-    """Return an element's part in an equation of motion, in symbols; check a user's."""
+    """Return an element's part in an equation of motion, in symbols; check that of a user's law."""
     if is_of_package(type(element)):
         return element.mechanics(values, x, v, s, states)
     try:
@@ -206,7 +206,7 @@ def _check_symbols(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) 
     if codes & {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER}:
         raise ModelError(
             f"{type(law).__name__} rounds, or takes a remainder (floor, ceil, round, trunc, mod, "
-            "//, %), and where that steps is not located; expected steps as comparisons, such as "
+            "//, %), whose steps cannot be located; expected steps as comparisons, such as "
             "(y < 0.2) + (y < 0.4)"
         )
     forces, direction = rng.uniform(-0.5, 0.5, TRIALS), np.resize([1.0, -1.0], TRIALS)

@@ -82,8 +82,8 @@ class StiffnessGradient(NamedTuple):
     by_amplitude : ndarray of complex
         dZ/dA.
     by_parameter : tuple of ndarray of complex
-        dZ/dp for each parameter p of the element, in the order of its `parameters`; empty where
-        they are not asked for, and 0 for a fixed parameter if the derivative would take time.
+        dZ/dp for each parameter p of the element, in the order of its `parameters`; empty if not
+        requested, and 0 for a fixed parameter whose derivative would take long.
     """
 
     value: ComplexArray
@@ -186,7 +186,7 @@ class Asymptote:
 
 
 class Combination(NamedTuple):
-    """A product of powers of parameters, which data may determine where its factors are not."""
+    """A product of powers of parameters that data may determine although its factors are not."""
 
     expression: str
     powers: Mapping[str, float]

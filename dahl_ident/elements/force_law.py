@@ -1,4 +1,4 @@
-"""Force laws: what is asked of every element, in plain numbers that are not checked."""
+"""The interface of every element. Its methods take plain numbers, and do not check them."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ class ForceLaw(ABC):
     parameters : tuple of Parameter
         In the order of the constructor: declarations on the class, with values on an element.
     optional : (Parameter, float) or None
-        One more parameter, and the argument with which an element does not have it.
+        A parameter that not every element has, and the argument that leaves it out.
     linear_parameters : tuple of str
         Labels of parameters in which the force is linear.
     scale_parameters : tuple of str
-        Labels of parameters that, all multiplied by one factor, multiply the force by it.
+        Labels of parameters: if all are multiplied by one factor, so is the force.
     like_parts : tuple of tuple of str
         Labels of each of several interchangeable parts; estimates are ordered by the first label.
     softens : bool
@@ -63,7 +63,7 @@ class ForceLaw(ABC):
     holds_at_rest : bool
         True: holding a constant displacement may take a force.
     starts : tuple of (str, str, str)
-        Name, unit and meaning of each unknown from which the states follow at the first sample.
+        Name, unit and meaning of each unknown that determines the states at the first sample.
     """
 
     kind: ClassVar[str] = ""
@@ -272,9 +272,9 @@ class ForceLaw(ABC):
         return any(p.is_mass and (p.free or p.value != 0.0) for p in self.parameters)
 
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
-        """Return the states at the first sample from the unknowns there, in plain arithmetic.
+        """Return the states at the first sample, given its unknowns, in plain arithmetic.
 
-        The states of a linear element are the unknowns themselves.
+        The unknowns of a linear element are its states.
         """
         return starts
 
@@ -283,11 +283,11 @@ class ForceLaw(ABC):
         return force
 
     def coarser(self) -> Self:
-        """Return this element, or an approximation whose motion under a force costs less."""
+        """Return this element, or an approximation whose motion under a force is faster."""
         return self
 
     def free_responses(self, time: FloatArray) -> FloatArray:
-        """Return a linear element's force from a unit of each initial state, (n, states)."""
+        """Return a linear element's force due to a unit of each initial state, (n, states)."""
         return np.zeros((time.size, 0))
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
@@ -309,7 +309,7 @@ class ForceLaw(ABC):
         return ()
 
     def combinations(self) -> tuple[Combination, ...]:
-        """Return products of powers that data may determine where their factors are not."""
+        """Return products of powers that data may determine although their factors are not."""
         return ()
 
     def universal_curve(self) -> UniversalCurve | None:

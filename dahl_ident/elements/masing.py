@@ -41,7 +41,7 @@ from dahl_ident.errors import ModelError
 
 _SERIES = 0.1  # angle below which y - sin(y) loses digits
 _NEARLY_SLIPS = 1.0 - 1e-6
-_ROOT_ROUNDING = 4.0 * EPS  # of a root
+_ROOT_ROUNDING = 4.0 * EPS  # relative tolerance of a root
 
 
 class Masing(Friction):

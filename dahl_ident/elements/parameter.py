@@ -29,7 +29,7 @@ UNITS: dict[str, Dimension] = {
     "rad": (0, 0, 0),
     "1": (0, 0, 0),
 }
-"""The units from which that of a parameter is made."""
+"""The units of which the unit of a parameter is made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class Parameter:
         return self.transform == "log"
 
     def nearest(self, value: float) -> float:
-        """Return the nearest possible value: of infinity, or of one beyond a bound by rounding."""
+        """Return the possible value nearest to one that is infinite, or just beyond a bound."""
         low = max(self.lower, SMALLEST if self.positive else -LARGEST)
         return float(np.clip(value, low, min(self.upper, LARGEST)))
 
@@ -155,7 +155,7 @@ class Parameter:
         return replace(self, name=name, value=value, free=None, assumed=assumed)
 
     def describe(self) -> Any:
-        """Return a fixed value as a number, "free", or a mapping with the details."""
+        """Return plain data: a fixed value, "free", or a mapping with the start and the bounds."""
         if not self.free:
             return {"assumed": self.value} if self.assumed else self.value
         limits = {"lower": self.lower, "upper": self.upper}
@@ -166,7 +166,7 @@ class Parameter:
         return {"free": True, **start, **bounds}
 
     def described(self, description: Any) -> Parameter:
-        """Return this parameter as :meth:`describe` wrote it."""
+        """Return this parameter with what :meth:`describe` returned."""
         if description == "free":
             return replace(self, value=None, free=True, assumed=False)
         if not isinstance(description, Mapping):

@@ -46,7 +46,7 @@ class PowerDamper(Element):
     coefficient : float, optional
         Force at the reference speed, N (N m in rotation), > 0. Given: fixed; left out: free.
     exponent : float, optional
-        Above 0 (the limit of Coulomb friction), 1 (viscous damping), up to 3. Given: fixed; left
+        Above 0, up to 3: near 0 it is Coulomb friction, at 1 viscous damping. Given: fixed; left
         out: free.
     reference_speed : float, default 1
         The speed at which the force is the coefficient, m/s (rad/s). With 1, the coefficient is

@@ -104,8 +104,8 @@ def settled(
     """Return the settled motions of a system under sines, one for each row, by shooting.
 
     Derivatives are with respect to the parameters `chosen`. Shooting begins from the states
-    `starts`, such as those of nearby parameters, or from rest. A number of `cycles` precede
-    Newton's method. The tolerance of a step's error is divided by `finer`.
+    `starts`, such as those of nearby parameters, or from rest. Newton's method begins after
+    `cycles` cycles. The tolerance of a step's error is divided by `finer`.
     """
     from dahl_ident.engine.radau import layout  # numba is slow to import
 
@@ -153,8 +153,8 @@ def steady_motions(
 ) -> Settled:
     """Return the steady motions of a system at rows of parameters, frequency and drive.
 
-    Each row begins from its states `starts` at t = 0, NaN for rest, and runs through some `cycles`
-    before it is solved for; if that fails, it is started `again`, from rest. A motion with a
+    Each row begins from its states `starts` at t = 0, NaN for rest, and runs through `cycles`
+    cycles before Newton's method; if that fails, it is started `again`, from rest. A motion with a
     multiplier above `largest` is rejected. If `one_sided`, the motion may differ in both directions
     even if the law does not: such motions come in pairs with the same fundamental if the symmetric
     motion is unstable.
@@ -215,7 +215,7 @@ def steady_motions(
     solve(possible & ~result.found)
     unstable = np.isfinite(result.multiplier)
     failed = possible & ~result.found & ~unstable
-    # a search passes values at which nothing settles; then only a few rows are worth the time
+    # in a search many rows may have no settled motion, and it would take long to try all again
     if must_be_stable or np.all(parameters == parameters[0]) or _FINER_STEPS * failed.sum() <= rows:
         solve(failed, finer=_FINER_STEPS)
     solve(possible & ~result.found & unstable, None, _LONG)
@@ -258,7 +258,7 @@ def loops(
 
 
 def _settled(found: FloatArray, result: ComplexArray, *others: FloatArray) -> Settled:
-    """Return what a kernel has found; NaN where nothing settles."""
+    """Return the results of a kernel; NaN in rows in which nothing settles."""
     result[found == 0] = np.nan
     return Settled(found.astype(bool), result[..., 0], result[..., 1], result[..., 2:], *others)
 
@@ -279,7 +279,7 @@ def march(
 
     `coefficients`, (degree + 1, m), are those of powers of the position, 0 to 1, between two of the
     `knots`, (m + 1,). The motion starts from the states `first` at the first of the `samples`.
-    FitError is raised if it grows beyond all bounds, or has no derivatives that are wanted.
+    FitError is raised if it grows beyond all bounds, or lacks the `derivatives` requested.
     """
     from dahl_ident.engine.radau import layout  # numba is slow to import
 

@@ -58,7 +58,7 @@ _FLAT = 1e-3
 _NEARLY_STILL = 0.01  # longest last step over the distance between the bounds
 _UNSEEN = 4.0 * EPS  # relative change of a cost that may be rounding
 _OF_ACCURACY = 0.3  # the same over the accuracy of predictions, if these are inaccurate
-_OVERTIME = 2.0  # steps of a higher search over those of a converged one, after which it ends
+_OVERTIME = 2.0  # a higher search ends after this multiple of a converged search's steps
 # relative changes of cost, step and slope at which scipy's searches end: a few hundred times EPS
 _OF_COST, _OF_STEP, _OF_SLOPE = 1e-13, 1e-10, 1e-14
 _EVALUATIONS = 300  # most evaluations of scipy's search, which needs about thirty
@@ -159,7 +159,7 @@ class _State(_Searches):
     hessian: FloatArray
 
     def moved(self, which: BoolArray, step: FloatArray, fall: FloatArray) -> _State:
-        """Return the state after a last short step of some searches."""
+        """Return the state after a last step of some searches, which is not evaluated."""
         return replace(
             self,
             theta=self.theta + np.where(which[:, None], step, 0.0),
@@ -181,10 +181,9 @@ def minimise(
     steps: int = 80,
     accuracy: float = EXPLICIT,
     bounds: Bounds | None = None,
-    unseen: bool = True,
     restrained: bool = False,
 ) -> Minima:
-    """Return the minima of the costs that searches from `theta`, shape (S, P), find.
+    """Return the minima of the costs that searches from `theta`, (S, P), reach.
 
     `logarithmic` marks the coordinates that are logarithms, whose steps are limited in length.
     Searches that leave the region `inside`, which is called like `evaluate`, end without
@@ -193,8 +192,8 @@ def minimise(
     search has converged; `enough` gives the fall of a cost that is negligible, whatever the length
     of the step: the search ends before it. `accuracy` is that of predictions, relative to the data.
     Steps end at the `bounds` of theta. In `restrained` searches a logarithmic step of 1 is
-    penalised like residuals of one standard deviation: coordinates with hardly any effect do not
-    move until the others have converged.
+    penalised like residuals of one standard deviation, so that coordinates with hardly any effect
+    do not move until the others have converged; the last step, which is not evaluated, is short.
     """
     owner = np.arange(len(theta)) if owner is None else owner
     S, P = theta.shape
@@ -206,8 +205,8 @@ def minimise(
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     last, before = np.full(S, 1e-300), np.zeros((S, P))
     close = np.zeros(S, dtype=np.bool_)
-    # steps of each owner's converged search
-    first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)
+    # fewest steps and lowest cost of each owner's converged searches
+    fewest, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)
     for count in range(steps if P else 0):
         noise = 2.0 * at.cost / max(n_residuals - P, 1)
         restraint = restrained * noise[:, None] * logarithmic
@@ -230,14 +229,15 @@ def minimise(
         if inside is not None:
             lost |= ~inside(at.theta, active)
         owners = owner[active]
-        lost |= (count > _OVERTIME * first[owners]) & (at.cost > lowest[owners])
+        lost |= (count > _OVERTIME * fewest[owners]) & (at.cost > lowest[owners])
         ended = settled | lost
         if ended.any():
             settled &= ~lost
             converged[active] = settled
-            np.minimum.at(first, owners[settled], count)
+            np.minimum.at(fewest, owners[settled], count)
             np.minimum.at(lowest, owners[settled], at.cost[settled])
-            ends.assign(active, at.moved(settled & ~stalled & (short | unseen), step, predicted))
+            moved = settled & ~stalled & (short | (not restrained))
+            ends.assign(active, at.moved(moved, step, predicted))
             kept = ~ended
             active, at = active[kept], at.take(kept)
             if not active.size:
@@ -341,9 +341,9 @@ def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: f
 def minimise_by_scipy(
     problem: Problem, start: FloatArray, scale: float, loss: Loss | None
 ) -> Minima:
-    """Return the minimum of one table's cost between its bounds, from one start, shape (P,).
+    """Return the minimum of one table's cost by scipy's trust-region reflective algorithm.
 
-    The trust-region reflective algorithm.
+    The search begins at `start`, (P,), and keeps within the problem's bounds.
     """
     from scipy import optimize
 

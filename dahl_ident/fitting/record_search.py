@@ -175,7 +175,6 @@ class RecordSearch:
             tolerance_factor=LOOSE,
             steps=most,
             bounds=within,
-            unseen=False,
             restrained=True,
         )
         theta, signs = problem.space.unfolded(end.theta)

@@ -89,11 +89,14 @@ def _non_negative(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _differ(first: list[float], second: list[float]) -> bool:
+    """Return whether a value differs from the other by a factor of about two."""
     a, b = np.array(first), np.array(second)
     return bool(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-300)) > 0.3)
 
 
 class _Scan:
+    """The scan of a problem's nonlinear parameters, with the fastest part of each record."""
+
     def __init__(self, problem: RecordProblem) -> None:
         self.problem = problem
         self.histories = [self._history(i) for i in range(len(problem.records))]
@@ -131,7 +134,7 @@ class _Scan:
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
-        begin: list[tuple[float, list[float]]] = []
+        solutions: list[tuple[float, list[float]]] = []  # misfit and values
         columns: dict[tuple[int, int], list[FloatArray]] = {}
         for node in product(*(range(len(c)) for c in choices)):
             for e, i in enumerate(node):
@@ -140,12 +143,12 @@ class _Scan:
             shapes = [choices[e][i] for e, i in enumerate(node)]
             sets = [columns[e, i] for e, i in enumerate(node)]
             if all(sets):
-                begin += self._solve(elements, shapes, sets)
-        if not begin:
+                solutions += self._solve(elements, shapes, sets)
+        if not solutions:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
-            begin = [(0.0, values)]
+            solutions = [(0.0, values)]
         chosen = list[list[float]]()
-        for _, values in sorted(begin, key=itemgetter(0)):
+        for _, values in sorted(solutions, key=itemgetter(0)):
             if len(chosen) < _STARTS and all(_differ(values, other) for other in chosen):
                 chosen.append(values)
         return chosen
@@ -191,14 +194,14 @@ class _Scan:
                     lengths = [size * (self.length * s) ** length for s in _LENGTHS]
                     grids.append(list(dict.fromkeys(lengths)))
                 elif parameter.lower < 0.0:
-                    some = [unit * s for s in _SIGNED]
-                    grids.append([*(-v for v in some), 0.0, *some])
+                    positive = [unit * s for s in _SIGNED]
+                    grids.append([*(-v for v in positive), 0.0, *positive])
                 else:
                     grids.append([unit * s for s in _LENGTHS])
         return grids
 
     def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
-        """Return the force along each record; none if one has no motion at these values."""
+        """Return the force along each record; empty if a record has no motion at these values."""
         try:
             return [
                 element.force_history(values, x, v, 0.0, acceleration=a, time=time)
@@ -213,9 +216,9 @@ class _Scan:
         shapes: list[tuple[float, ...]],
         sets: list[list[FloatArray]],
     ) -> list[tuple[float, list[float]]]:
-        """Return misfit and values with the best linear parameters that are not negative.
+        """Return the misfit and the values with the best linear parameters; empty if impossible.
 
-        A plant whose mass, damping and stiffness are not negative has a finite motion.
+        They are not negative, so that a plant with these values has a finite motion.
         """
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
         normal = np.zeros((sum(scaled) + 1, sum(scaled) + 1))
@@ -296,7 +299,7 @@ class _Scan:
 
 @np.errstate(all="ignore")  # laws far off may overflow
 def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
-    """Return all values of a problem from the model's free ones: with states and offsets."""
+    """Return all values of a problem, states and offsets included, from the model's free ones."""
     full = np.zeros(len(problem.parameters))
     full[: len(values)] = values
     for number, measured in enumerate(problem.measured):

@@ -201,7 +201,7 @@ def _single_valued(knowledge: Knowledge, drive: FloatArray, frequency_hz: FloatA
 
 @dataclass(frozen=True)
 class BenchTime:
-    """The time of measuring candidates.
+    """The time that it takes to measure candidates.
 
     A transient starts with the size abs(F - F')/F relative to the friction force F, with F' that of
     the previous level, and is multiplied by `decay` in each cycle; measuring starts when it is
@@ -279,7 +279,7 @@ class BenchTime:
 def _ring_down(
     model: Model, values: Sequence[FloatArray], A: FloatArray, omega: FloatArray
 ) -> FloatArray:
-    """Return the factor of the plant's free vibration in one cycle of the drive.
+    """Return the factor by which the plant's free vibration decays in a cycle of the drive.
 
     It is exp(-pi Im Z/(m omega^2)) with the mass m = -d Re Z/d(omega^2), at the steady amplitude.
     """

@@ -1,6 +1,6 @@
 """Prior knowledge for a plan, from a model with ranges, a fit, or a posterior.
 
-All in search coordinates: the logarithm of positive parameters, the value of others.
+All numbers are in search coordinates: the logarithm of positive parameters, the value of others.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Knowledge:
         return replace(self, theta=self.theta[draws], information=self.information[draws])
 
     def thinned(self, most: int) -> Knowledge:
-        """Return the knowledge at `most` of the draws at most, evenly spread."""
+        """Return the knowledge at no more than `most` of the draws, evenly spread."""
         return self.only(spread(len(self.theta), most))
 
     def problem_at(
@@ -266,8 +266,8 @@ def _of_records(
     problem: RecordProblem = fit.optimum.problem
     if problem.output != "force":
         raise ValidationError(
-            "plan: the fit predicts the motion of a driven plant; planned are fits of frequency "
-            "responses, and of records whose force was predicted: give the model with "
+            "plan: the fit predicts the motion of a driven plant; expected a fit of a frequency "
+            "response, a fit of records whose force it predicts, or the model with "
             f"{argument('ranges')}"
         )
     free, P = tuple(problem.free), len(problem.free)
@@ -284,7 +284,7 @@ def _of_records(
     assumed = tuple(exponent.name for exponent in exponents)
     model = problem.model.with_free(assumed)
     parameters = tuple(p for p in model.parameters if p.free)
-    # what a standard deviation of each exponent does to the others and to its logarithm
+    # changes of the others, and of its logarithm, with a standard deviation of each exponent
     others = np.array([p.std * p.others[:P] / slope for p in exponents]).reshape(-1, P)
     root = np.vstack([others.T, np.diag([p.std for p in exponents])])
     joint = root @ root.T
@@ -358,9 +358,9 @@ def _among(
     part: FloatArray,
     others: float | None = None,
 ) -> FloatArray:
-    """Return numbers of all parameters, (..., P), from those of some.
+    """Return an array over all parameters, (..., P), from `part`, an array over those named.
 
-    The others have the number `others`, or else the logarithm of their value.
+    The others have the number `others`; if that is None, the logarithm of their value.
     """
     numbers = np.array([np.log(p.value or 1.0) if others is None else others for p in parameters])
     numbers = numbers * np.ones((*part.shape[:-1], 1))
@@ -379,7 +379,7 @@ def _moments(parameters: Sequence[Parameter], ranges: Ranges) -> tuple[FloatArra
     unknown = set(ranges) - {p.name for p in parameters}
     if unknown:
         raise ValidationError(
-            f"ranges names {', '.join(sorted(unknown))}; free are "
+            f"ranges names {', '.join(sorted(unknown))}; the free parameters are "
             f"{choices((p.name for p in parameters), *unknown)}"
         )
     centre, std = np.zeros(len(parameters)), np.full(len(parameters), np.inf)

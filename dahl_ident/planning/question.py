@@ -75,7 +75,7 @@ class BenchLimits:
 
 @dataclass(frozen=True)
 class CycleNoise:
-    """Noise of one cycle: of ln gain and phase, and of each part of force (N) and displacement."""
+    """Noise of one cycle: of ln gain and phase, and of both parts of force, N, and displacement."""
 
     relative: float
     force: float = 0.0
@@ -90,7 +90,7 @@ class CycleNoise:
 
 @dataclass(frozen=True)
 class RecordedForce:
-    """White noise of a sample of force in the records of motions, N, and samples a second."""
+    """White noise of each sample of force in a record, N, and the samples a second."""
 
     noise: float
     sample_rate: float
@@ -162,8 +162,8 @@ def recorded_force(
         return RecordedForce(knowledge.sample_noise, rate)
     if not isinstance(noise, Mapping) or set(noise) != {"force"}:
         raise ValidationError(
-            f"noise is {noise!r}; of motions in time give that of a force sample alone, its "
-            "standard deviation in N, such as {'force': 0.001}"
+            f"noise is {noise!r}; for motions in time, give only the standard deviation of a force "
+            "sample in N, such as {'force': 0.001}"
         )
     return RecordedForce(positive_number(noise["force"], "noise['force']"), rate)
 
@@ -182,7 +182,7 @@ def motions_among(candidates: Any) -> str | tuple[PlannedMotion, ...]:
     listed = tuple(candidates)
     are_motions = [isinstance(candidate, PlannedMotion) for candidate in listed]
     if any(are_motions) and not all(are_motions):
-        raise ValidationError("candidates holds motions and others; plan one or the other")
+        raise ValidationError("candidates holds motions and others; plan either of them")
     return listed if any(are_motions) else ()
 
 
@@ -203,7 +203,7 @@ def target_of(target: Any) -> tuple[dict[str, float], bool]:
 def larger_model(
     knowledge: Knowledge, larger: Element | None, suspects: Mapping[str, float] | None
 ) -> Model | None:
-    """Return the model in which suspected parameters are free; None where there are none."""
+    """Return the model in which suspected parameters are free; None if there are none."""
     if not suspects:
         if larger is not None:
             raise ValidationError("larger is given without suspects; name its parameters there")

@@ -192,7 +192,7 @@ PlannedMotion = Trapezoid | Multisine
 
 
 def seconds_of_move(distance: float, speed: float, acceleration: float) -> float:
-    """Return the shortest time of a quintic from rest to rest at most this fast."""
+    """Return the least time of a move along a quintic, from rest to rest, within these limits."""
     v, a = 15.0 / 8.0, 10.0 / np.sqrt(3.0)  # its peaks for 1 m in 1 s
     return max(v * distance / speed, float(np.sqrt(a * distance / acceleration)))
 

@@ -54,7 +54,7 @@ class FittedModel(Result):
 
     def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
         self.optimum = optimum  #: The solver's plain result.
-        #: Whether errors are of first order alone: with constraints.
+        #: Whether errors are only of first order, as in fits with constraints.
         self.first_order = first_order
 
     @cached_property
@@ -72,11 +72,11 @@ class FittedModel(Result):
     method: str = part("optimum.method", "The solver.")
     message: str = part("optimum.message", "How the search ended, in words.")
     scale_known: bool = part("optimum.scale_known", "Whether the noise's scale was known.")
-    ndata: int = part("problem.n_nonzero", "Real numbers: two a row, one that of a mean force.")
+    ndata: int = part("problem.n_nonzero", "Real numbers: two a row, one for a mean force.")
     nfree: int = part("optimum.dof", "Degrees of freedom.")
     nfev: int = part("optimum.nfev", "Evaluations of the residuals.")
     combinations: tuple[DeterminedCombination, ...] = part(
-        "optimum.combinations", "What the data determine where single parameters run away."
+        "optimum.combinations", "What the data determine if single parameters run away."
     )
     log_likelihood: float = part(
         "optimum.log_likelihood",
@@ -99,17 +99,17 @@ class FittedModel(Result):
         'noise ("white"), or filtered by their spectrum ("spectrum").',
     )
 
-    # What the data tell
+    # What the data show
 
     success: bool = part(
-        "assessment.success", "Whether the search found a finite optimum; of records, any."
+        "assessment.success", "Whether the search found an optimum; of tables, a finite one."
     )
     errors: Any = part(
-        "assessment.errors", "The sources of error; None where a table leaves nothing to judge by."
+        "assessment.errors", "The sources of error; None if a table does not determine them."
     )
     errors_of_combinations: Any = part(
         "assessment.errors_of_combinations",
-        "Of tables: also where only combinations of parameters are determined, for these alone.",
+        "Of tables: the same, also if only combinations of parameters are determined.",
     )
     goodness: Any = part("assessment.goodness", "Statistics and tests of the residuals.")
     cross_validation: Any = part(
@@ -121,7 +121,7 @@ class FittedModel(Result):
     )
     assumed: tuple[str, ...] = part(
         "assessment.assumed",
-        "Names of parameters that were not given; the uncertainty counts their ranges.",
+        "Names of parameters that the user did not give; the uncertainty counts their ranges.",
     )
     model: Model = part(
         "assessment.model", "The model with the estimates put in; free parameters stay free."
@@ -137,30 +137,30 @@ class FittedModel(Result):
     )
     redchi: float = part(
         "assessment.redchi",
-        "`chisqr` over its degrees of freedom; the squared scale where that was estimated.",
+        "`chisqr` over its degrees of freedom; the squared scale if that was estimated.",
     )
     scale: float = part(
         "assessment.estimate.scale",
-        "Standard deviation of the residuals: 1 where known beforehand.",
+        "Standard deviation of the residuals: 1 if the noise is known.",
     )
     residuals: tuple[FloatArray, ...] = part(
         "assessment.residuals", "Of records: measured minus predicted, record by record."
     )
     effective_samples: float = part(
         "assessment.effective_samples",
-        "Of records: white samples that would tell as much as the residuals.",
+        "Of records: number of independent samples with as much information.",
     )
 
     @cached_property
     def params(self) -> Parameters:
         """Every parameter by name, with combined uncertainties.
 
-        Assumed exponents of tables have their estimates, so that all of them are a model.
+        Assumed exponents of tables have their estimates, so that the values together are a model.
         """
         return Parameters.of(self.problem, *self.assessment.known)
 
     def verdict_on(self, name: str) -> tuple[Verdict, str]:
-        """Return whether the data determine a parameter, and what they say of it."""
+        """Return whether the data determine a parameter, and what they show, in words."""
         known = self.identifiability.parameters[name]
         return known.verdict, known.reason
 
@@ -217,20 +217,20 @@ class FittedModel(Result):
         levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
         replicates, seed : int
-            Of the bootstrap; fewer replicates of records, each of which is a search.
+            Of the bootstrap. By default there are fewer replicates of records, as each is a search.
 
         Returns
         -------
         ConfidenceIntervals
             A mapping from the parameter's name to its intervals; a side on which the data set no
-            limit is open. Profiles never raise, however badly a parameter is determined. Where
-            the fit had constraints, "combined" gives Wald's, and says so.
+            limit is open. Profiles never raise, however badly a parameter is determined. If the
+            fit had constraints, "combined" returns Wald intervals, and says so.
 
         Raises
         ------
         ValidationError
-            If `method` is unknown, a level is not between 0 and 1, or repetitions of a fit with
-            a robust loss, or profiles or repetitions of one with constraints, are wanted.
+            If `method` is unknown, a level is not between 0 and 1, the fit had a robust loss and
+            `method` is "bootstrap", or it had constraints and `method` is "bootstrap" or "profile".
         FitError
             If there is no optimum to repeat.
         """
@@ -246,8 +246,8 @@ class FittedModel(Result):
         Parameters
         ----------
         methods : sequence of str, default ("wald", "bootstrap", "profile")
-            Those that count noise alone. The last is the most trusted; each of the others is
-            compared with it. The combined intervals stand in front of them.
+            Methods that count noise alone. Each is compared with the last, which is the most
+            trusted. The combined intervals come first in the table.
         levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
 
@@ -283,7 +283,7 @@ class FittedModel(Result):
 
     @cached_property
     def stated_budget(self) -> Budget | None:
-        """The uncertainty budget; None where there is nothing to state."""
+        """The uncertainty budget; None if there is none."""
         try:
             return self.budget()
         except FitError:
@@ -323,7 +323,7 @@ class FittedModel(Result):
     ) -> Any:
         """Return what another measurement of the device should show, with its bands.
 
-        Bands count every source of the budget, and what the device departs from the model.
+        Bands count every source of the budget, and the departure of the device from the model.
 
         Parameters
         ----------
@@ -331,15 +331,15 @@ class FittedModel(Result):
             Of a fit of a table: frequencies, Hz. Of a fit of records: another record, with the
             same channels.
         amplitude : array_like, shape (n,), optional
-            Displacement amplitude, m or rad, where that is controlled.
+            Displacement amplitude, m or rad, if that is controlled.
         drive : array_like, shape (n,), optional
-            Force amplitude, N or N m, where that is controlled. Give one of the two.
+            Force amplitude, N or N m, if that is controlled. Give one of the two.
         quantity : str, optional
-            One of the six standard quantities; left out, that of the data.
+            One of the six standard quantities; by default that of the data.
         noise : bool, default True
-            The band holds what one more test would measure, its noise and scatter included;
-            False: the device's response itself. Records do not show the noise of a table, so
-            tables predicted from them have this band in any case.
+            True: the band holds what one more test would measure, noise and scatter included.
+            False: it holds the response of the device. A fit of records, which do not show the
+            noise of a table, always predicts the response of the device.
         initial : {"fitted", "rest"}, default "fitted"
             Whether the state at a record's first sample and its offset are fitted, the model's
             parameters held, or taken as zero.
@@ -375,9 +375,9 @@ class FittedModel(Result):
         Parameters
         ----------
         parts : int, optional
-            In how many parts each record is cut. Left out: several records are left out as a
-            whole, one at a time, and a single one is cut in four. Tests of tables are left out
-            one at a time.
+            Number of parts into which each record is cut. By default several records are left
+            out as a whole, one at a time, and a single one is cut into four parts. Tests of tables
+            are left out one at a time.
 
         Returns
         -------
@@ -407,7 +407,7 @@ class FittedModel(Result):
         Returns
         -------
         FrequencyResponse
-            Of the quantity "backbone"; its standard deviations are those of the device's.
+            Of the quantity "backbone", with standard deviations for the device.
 
         Raises
         ------
@@ -418,7 +418,7 @@ class FittedModel(Result):
         return predicted_backbone(optimum, self.model, amplitude, errors)
 
     def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
-        """Return N(A) of the friction alone, with bands that hold the device's.
+        """Return N(A) of the friction alone, with bands for the device.
 
         Parameters
         ----------
@@ -445,9 +445,9 @@ class FittedModel(Result):
         Parameters
         ----------
         amplitudes : sequence of float, optional
-            Where energy, stiffness and damping are wanted, m or rad.
+            Amplitudes at which to return energy, stiffness and damping, m or rad.
         frequency_hz : float, optional
-            For the equivalent damping; left out, there is none.
+            For the equivalent damping, which needs it.
 
         Returns
         -------

@@ -129,7 +129,7 @@ def read_parquet(file: File) -> RawFile:
     schema, rows = table.schema_arrow, table.metadata.num_rows
     stored = schema.metadata or {}
     attributes = json.loads(stored.get(b"pandas", b"{}")).get("attributes")
-    if not attributes:  # of older releases of pyarrow and pandas
+    if not attributes:  # written by older releases of pyarrow and pandas
         attributes = json.loads(stored.get(b"PANDAS_ATTRS", b"{}"))
     saved = attributes.get("dahl_ident") if isinstance(attributes, dict) else None
     metadata = {} if saved is None else read_metadata(json.dumps(saved))
@@ -215,7 +215,7 @@ def read_json(file: File) -> RawFile:
     try:
         text = utf8(file.lines(b"[{")).decode("utf-8", "replace")
         file.refuse_above_limit(8 * text.count(","), f"JSON of {text.count(',')} numbers")
-        content = json.loads(text, object_pairs_hook=_object)
+        content = json.loads(text, object_pairs_hook=_json_object)
     except DataError:  # a ValueError too
         raise
     except (ValueError, RecursionError) as exc:
@@ -223,7 +223,8 @@ def read_json(file: File) -> RawFile:
     return dictionary_source(content, file.name, "JSON", file.sha256)
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _json_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON; refuse one that has a name twice, of which dict keeps the last."""
     content = dict(pairs)
     if len(content) < len(pairs):
         repeated = next(n for n, count in Counter(n for n, _ in pairs).items() if count > 1)
@@ -380,7 +381,8 @@ class Run(NamedTuple):
 class Header:
     """Names and units of the columns; no names for a table without a header.
 
-    `cells` is the number of columns in the header line; `contradicted`: another line differs.
+    `cells` is the number of columns in the header line. If it is `contradicted`, another line names
+    the same columns differently.
     """
 
     names: tuple[str, ...]
