@@ -274,6 +274,22 @@ def test_what_is_not_determined_is_said_with_the_motion_that_would():
     assert ", not determined, because the motion moves no farther than" in fit.verdict
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_limit_that_no_motion_reaches_is_bounded_from_below(seed):
+    """The data are the same for any larger limit."""
+    t = np.arange(1000) / 200.0
+    x = 2e-6 * np.sin(np.pi * t) + 1e-6 * np.sin(0.62 * np.pi * t + 1.0)
+    noise = np.random.default_rng(seed).standard_normal(1000)
+    record = di.Record(t, displacement=x, force=DAHL.force(x) + 1e-5 * noise)
+    fit = di.fit(record, di.Dahl(alpha=1.0), throw=False)
+    assert fit.status == "not determined"
+    (interval,) = fit.conf_interval(levels=(0.9545,))["f_max"]
+    assert interval.lower < 0.1
+    assert interval.upper == np.inf
+    assert ("f_max: at least " in fit.verdict) == (interval.lower > 0.0)
+    assert_near(fit, {"sigma": 30.0}, 3.0)
+
+
 def test_a_displacement_that_is_constant_determines_nothing(tmp_path):
     t = np.arange(400) / 100.0
     force = 1e-3 * np.random.default_rng(0).standard_normal(400)

@@ -52,7 +52,7 @@ from dahl_ident.units import counted
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which limits are value * factor and value / factor
-_LARGE = 0.1  # u of a logarithm from noise alone, above which a side may be open
+LARGE = 0.1  # u of a logarithm from noise alone, above which a side may be open
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _DISAGREES = 0.2  # half widths between the limits of two methods
 _LIMIT_ROUNDING = 1e-9  # relative difference of limits that is rounding
@@ -183,7 +183,7 @@ def combined_intervals(
     positive = optimum.problem.space.positive
     noise = errors.by_noise
     by_noise = np.sqrt(np.diagonal(noise.covariance))
-    doubtful = ~determined | ~(by_noise <= _LARGE * natural_sizes(noise))
+    doubtful = ~determined | ~(by_noise <= LARGE * natural_sizes(noise))
     if doubtful.any():
         shape = profile()
         values = np.where(determined, values, shape.estimate)

@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dahl_ident.arrays import BoolArray, FloatArray, IntArray
+from dahl_ident.arrays import EPS, BoolArray, FloatArray, IntArray, unit_diagonal
 from dahl_ident.elements import Parameter
 from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.fitting import Optimum
@@ -49,6 +49,7 @@ _TOLERANCE_FACTOR = 1e5  # the deviance, flat at its minimum, still errs by 1e-6
 _ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
 _SAME_DEVIANCE = 0.1  # relative difference: 5 % of the distance to a limit
 # Where a search gives up
+_FAR, _FEW_STEPS = float(np.log(100.0)), 3  # distance of a logarithm, and steps of the others
 _FARTHEST_LINEAR = 1e6  # conditional standard errors, if the parameter is not a logarithm
 _FARTHEST_LOG = 80.0  # distance of a logarithm from the optimum
 _FARTHEST_RATIO = 4.0  # the same of a pure number: an exponent or a gain
@@ -244,6 +245,26 @@ class Profiler:
         change = moved[:, None] * tangent
         limited = np.clip(change, -_LONGEST_LOG_STEP, _LONGEST_LOG_STEP)
         return np.where(self._logarithmic & (change != moved[:, None]), limited, change)
+
+    def open_sides(self, index: IntArray, thresholds: FloatArray) -> BoolArray:
+        """Return on which sides the data allow a hundred times less or more, shape (2, L, n).
+
+        `index` are n positive parameters. The others take Gauss-Newton steps without damping, along
+        which first states and offsets, which are nearly interchangeable, follow. They are few, so
+        the deviance may be stated too large, and a side not as open.
+        """
+        theta = np.tile(self._optimum.theta, (2, index.size, 1))
+        theta[:, np.arange(index.size), index] += np.array([[-_FAR], [_FAR]])
+        rows, held = theta.reshape(-1, theta.shape[-1]), np.tile(index, 2)
+        least = np.full(len(rows), np.inf)
+        for _ in range(_FEW_STEPS):
+            at = self._problem.quadratic(rows, self._scale, self._loss)
+            least = np.fmin(least, at.cost)
+            pairs = zip(*at[1:], held, strict=True)
+            step = np.array([_step_of_others(*pair) for pair in pairs])
+            rows = rows + np.where(self._logarithmic, np.clip(step, -1.0, 1.0), step)
+        deviance = 2.0 * (least - self._least_cost) * self._stretch[held]
+        return np.asarray(deviance.reshape(2, 1, -1) < thresholds[:, None] ** 2)
 
     # Constrained problems
 
@@ -472,6 +493,19 @@ def _friction_of(chart: Chart) -> tuple[int, int]:
     sigma = chart.tied[1]
     (f_max,) = (int(i) for i in np.flatnonzero(chart.matrix[sigma]) if i != sigma)
     return f_max, sigma
+
+
+def _step_of_others(gradient: FloatArray, hessian: FloatArray, held: int) -> FloatArray:
+    """Return the Gauss-Newton step, (P,), of all coordinates but one; none where it is infinite."""
+    if not np.isfinite(hessian).all():
+        return np.zeros(gradient.size)
+    others = np.arange(gradient.size) != held
+    matrix, size = unit_diagonal(hessian[np.ix_(others, others)])
+    step = np.zeros(gradient.size)
+    step[others] = (
+        -np.linalg.pinv(matrix, rcond=EPS, hermitian=True) @ (gradient[others] / size) / size
+    )
+    return step
 
 
 def _tangent(hessian: FloatArray, index: IntArray) -> FloatArray:

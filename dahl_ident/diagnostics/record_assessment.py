@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import TINY, FloatArray, whole_number
+from dahl_ident.arrays import TINY, BoolArray, FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
 from dahl_ident.diagnostics.advice import record_advice
@@ -22,12 +22,14 @@ from dahl_ident.diagnostics.confidence_levels import (
     coverage_factor,
     coverage_factors,
     level_text,
+    thresholds,
 )
 from dahl_ident.diagnostics.contributions import ALONG_MOTION, MODEL_ERROR, NOISE, variances
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.goodness import Goodness
-from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
+from dahl_ident.diagnostics.intervals import LARGE, ConfidenceIntervals, around
 from dahl_ident.diagnostics.misfit_explanations import force_convention
+from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.diagnostics.record_errors import (
     RecordErrors,
     errors_on_constraints,
@@ -245,7 +247,10 @@ class RecordAssessment(Assessment):
         )
 
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
-        """Return intervals that count every source of error."""
+        """Return intervals that count every source of error.
+
+        They are open where far larger or smaller values describe the records nearly as well.
+        """
         array = checked_levels(levels)
         values = self.optimum.values
         assumed = self.errors.assumed
@@ -253,6 +258,12 @@ class RecordAssessment(Assessment):
         k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
         lower, upper = around(self.problem.space, values, u, k)
+        asked = np.flatnonzero(self._doubtful)
+        if asked.size:
+            noise = self.by_noise
+            below, above = Profiler(noise).open_sides(asked, thresholds(noise, array))
+            lower[:, asked] = np.where(below, 0.0, lower[:, asked])
+            upper[:, asked] = np.where(above, np.inf, upper[:, asked])
         ln_u = np.array([p.std for p in assumed])
         ln_U = coverage_factors(self.errors.least_dof, array[:, None]) * ln_u
         assumed_values = np.array([p.value for p in assumed])
@@ -267,6 +278,16 @@ class RecordAssessment(Assessment):
             np.hstack([upper, assumed_values * np.exp(ln_U)]),
             note,
         )
+
+    @property
+    def _doubtful(self) -> BoolArray:
+        """Which of the model's parameters may have an interval with an open side, (P,)."""
+        if self.first_order:
+            return np.zeros(0, dtype=np.bool_)
+        count = self.problem.n_reported
+        with np.errstate(divide="ignore"):
+            u = np.sqrt(np.diagonal(self.errors.contributions[NOISE])) / self.optimum.values
+        return np.asarray(self.problem.space.positive & ~(u <= LARGE))[:count]
 
     @cached_property
     def identifiability(self) -> Identifiability:
