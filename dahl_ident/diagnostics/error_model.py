@@ -331,6 +331,7 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
 
 
 def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) -> ErrorModel:
+    """Return the error model of an optimum, with the sources that the residuals show."""
     problem, assumed = with_assumed(problem)
     estimate = weighted_estimate(optimum, problem, determined=determined)
     few = problem.n_nonzero - len(problem.names) + len(assumed) < _LEAST_DOF
@@ -358,32 +359,33 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     labels += [p.source for p in assumed.values()]
     # with the exponents estimated, and with exact ones
     units = np.array(
-        [_unit_covariances(estimate.lever(exact), state) for exact in (set[str](), exponents)]
+        [_unit_covariances(estimate.lever(known), state) for known in (set[str](), exponents)]
     )
     sizes = np.append(state.sizes, np.ones(problem.n_priors))
     if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
-        model = np.array(labels) == MODEL_ERROR
-        size = np.einsum("kii,k->i", units[0, model], sizes[model])
-        most = _SHARED_BY * np.diagonal(by_tests)
-        limit = np.sqrt(np.divide(most, size, out=np.ones(len(size)), where=size > most))
-        units[:, model] *= np.outer(limit, limit)
-    every, exact = (_by_source(labels, sizes[:, None, None] * each) for each in units)
+        of_model = np.array(labels) == MODEL_ERROR
+        u2 = np.einsum("kii,k->i", units[0, of_model], sizes[of_model])
+        largest = _SHARED_BY * np.diagonal(by_tests)
+        factor = np.sqrt(np.divide(largest, u2, out=np.ones(len(u2)), where=u2 > largest))
+        units[:, of_model] *= np.outer(factor, factor)
+    contributions, at_exact = (_by_source(labels, sizes[:, None, None] * each) for each in units)
     if exponents:
-        added = np.asarray(sum(every.values())) - np.asarray(sum(exact.values()))
-        every = {**exact, EXPONENT: positive_part(added)}
+        added = np.asarray(sum(contributions.values())) - np.asarray(sum(at_exact.values()))
+        contributions = {**at_exact, EXPONENT: positive_part(added)}
     if estimate.second is not None:
-        every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
+        contributions[EXPONENT] = contributions[EXPONENT] + np.outer(
+            estimate.second, estimate.second
+        )
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
-        by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         if estimate.chance < _FALSE_ALARM and len(tests) <= _MOST_REFITS:
             by_tests = jackknife_with_weights(estimate, optimum, tests)
         calibrations = {CHANNELS.get(name, name) for name in problem.priors}
-        seen = [part for name, part in every.items() if name not in calibrations]
-        C, least = np.asarray(sum(seen)), by_chance**2 * np.diagonal(by_tests)
-        u2 = np.diagonal(C)
-        wider = np.sqrt(np.divide(least, u2, out=np.ones(len(C)), where=(least > u2) & (u2 > 0.0)))
-        if (wider > 1.0).any():
-            every[TESTS] = positive_part(C * np.outer(wider, wider) - C)
+        parts = [part for name, part in contributions.items() if name not in calibrations]
+        C, jackknife_error = np.asarray(sum(parts)), 1.0 / np.sqrt(2.0 * (len(tests) - 1))
+        u2, least = np.diagonal(C), (1.0 - jackknife_error) ** 2 * np.diagonal(by_tests)
+        factor = np.sqrt(np.divide(least, u2, out=np.ones(len(C)), where=(least > u2) & (u2 > 0.0)))
+        if (factor > 1.0).any():
+            contributions[TESTS] = positive_part(C * np.outer(factor, factor) - C)
     by_runs = None
     if estimate.regular and len(problem.data.runs or ()) > 1:
         runs = grouped_rows(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
@@ -394,7 +396,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         estimate,
         sources,
         state,
-        every,
+        contributions,
         len(tests),
         tuple(assumed),
         units[:, : state.model.count],

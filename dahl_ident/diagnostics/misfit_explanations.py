@@ -124,10 +124,10 @@ def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
     """Return how far the sum of squares falls without each point: r' (I - H)^-1 r."""
     pairs = r.reshape(-1, 2, 1)
     Q = lever.reshape(len(pairs), 2, -1)
-    left = np.eye(2) - Q @ Q.swapaxes(1, 2)
-    fixed = np.linalg.det(left) < 1e-8  # a point that alone determines a parameter
-    left[fixed] = np.eye(2)
-    squares = np.sum(pairs * np.linalg.solve(left, pairs), axis=(1, 2))
+    remaining = np.eye(2) - Q @ Q.swapaxes(1, 2)
+    fixed = np.linalg.det(remaining) < 1e-8  # a point that alone determines a parameter
+    remaining[fixed] = np.eye(2)
+    squares = np.sum(pairs * np.linalg.solve(remaining, pairs), axis=(1, 2))
     return np.where(fixed, 0.0, squares)
 
 

@@ -358,7 +358,7 @@ class RecordAssessment(Assessment):
         return self.errors.runs
 
     def design(self, *, counted: bool) -> dict[str, Any]:
-        """Return what the number of records assumes."""
+        """Return what is assumed because of the number of records, or is not known."""
         exponents = self.problem.exponents
         unseen = [p.name for p in exponents if p.assumed and p.name not in self.assumed]
         unfound = tuple(unseen) if counted and not self.first_order else ()
@@ -510,9 +510,9 @@ class RecordAssessment(Assessment):
 
 
 def _natural_size(parameter: Parameter, value: float) -> float:
-    """Return what the uncertainty of a parameter is compared with.
+    """Return the size with which the uncertainty of a parameter is compared.
 
-    Its value; its bounds for one that may be zero, such as an asymmetry, if they are larger.
+    It is the value, or for a parameter that may be zero, such as an asymmetry, a larger bound.
     """
     limit = min(parameter.upper, -parameter.lower) if parameter.lower < 0.0 else 0.0
     return max(limit if np.isfinite(limit) else 0.0, abs(value), TINY)

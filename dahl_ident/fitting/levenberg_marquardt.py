@@ -203,7 +203,7 @@ def minimise(
     ends = at.take(active)
     converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
-    last, before = np.full(S, 1e-300), np.zeros((S, P))
+    last_moves, last_step = np.full(S, 1e-300), np.zeros((S, P))
     close = np.zeros(S, dtype=np.bool_)
     # fewest steps and lowest cost of each owner's converged searches
     fewest, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)
@@ -211,8 +211,8 @@ def minimise(
         noise = 2.0 * at.cost / max(n_residuals - P, 1)
         restraint = restrained * noise[:, None] * logarithmic
         step, moves, predicted, longest = _step(at, damping, logarithmic, bounds, restraint)
-        shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
-        settled = moves * np.minimum(1.0, moves / last) <= shortest
+        shortest = tolerance_factor**2 * _tolerance(at, logarithmic, noise, accuracy)
+        settled = moves * np.minimum(1.0, moves / last_moves) <= shortest
         settled |= predicted <= tolerance_factor**2 * EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
         settled &= predicted <= at.cost  # a larger fall is rounding
@@ -243,9 +243,9 @@ def minimise(
             if not active.size:
                 break
             step, moves, predicted = step[kept], moves[kept], predicted[kept]
-            damping, growth, last, before = damping[kept], growth[kept], last[kept], before[kept]
-            close = close[kept]
-        factor = _extrapolation(at.hessian, step, before)
+            damping, growth, close = damping[kept], growth[kept], close[kept]
+            last_moves, last_step = last_moves[kept], last_step[kept]
+        factor = _extrapolation(at.hessian, step, last_step)
         longest = np.abs(step * logarithmic).max(axis=1)
         factor = np.clip(_LONGEST_STEP / np.maximum(longest, 1e-300), 1.0, factor)
         step = factor[:, None] * step
@@ -259,8 +259,8 @@ def minimise(
         lower = np.maximum(damping * np.maximum(_EASING, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, lower, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
-        last = np.where(better, moves, 1e-300)
-        before = np.where((better & (factor == 1.0))[:, None], step, 0.0)
+        last_moves = np.where(better, moves, 1e-300)
+        last_step = np.where((better & (factor == 1.0))[:, None], step, 0.0)
         at = new if better.all() else at.where(better, new)
     ends.assign(active, at)
     return Minima(ends.theta, ends.cost, ends.hessian, converged, evaluations)
@@ -316,23 +316,24 @@ def _step(
     return delta / size, moves, predicted, longest
 
 
-def _extrapolation(hessian: FloatArray, step: FloatArray, before: FloatArray) -> FloatArray:
-    """Return the factor of a step that continues a geometric series, to reach its sum at once.
+def _extrapolation(hessian: FloatArray, step: FloatArray, last_step: FloatArray) -> FloatArray:
+    """Return the factor that extends a step of a geometric series to the limit of the series.
 
-    If a model is curved and its misfit large, the ratio of each Gauss-Newton step to the one
-    `before` is constant.
+    If a model is curved and its misfit large, the ratio of each Gauss-Newton step to the last one
+    is constant.
     """
-    along, past = ((hessian @ delta[:, :, None])[:, :, 0] for delta in (step, before))
-    product, squares = (step * past).sum(axis=1), (before * past).sum(axis=1)
+    along, past = ((hessian @ delta[:, :, None])[:, :, 0] for delta in (step, last_step))
+    product, squares = (step * past).sum(axis=1), (last_step * past).sum(axis=1)
     ratio = product / np.maximum(squares, 1e-300)
     alike = product**2 > _GEOMETRIC * squares * (step * along).sum(axis=1)
     return np.where(alike & (ratio > 0.0), 1.0 / (1.0 - np.minimum(ratio, _SLOWEST)), 1.0)
 
 
-def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: float) -> FloatArray:
+def _tolerance(
+    at: _State, logarithmic: BoolArray, noise: FloatArray, accuracy: float
+) -> FloatArray:
     """Return the squared length of a negligible step."""
     P = at.theta.shape[1]
-    noise = 2.0 * at.cost / max(n_residuals - P, 1)
     lever = np.where(logarithmic, 1.0, at.theta)
     signal = (at.hessian[:, range(P), range(P)] * lever**2).max(axis=1)
     return np.asarray(np.maximum(_NOISE_TOLERANCE**2 * noise, accuracy**2 * signal))

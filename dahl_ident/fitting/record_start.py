@@ -135,15 +135,15 @@ class _Scan:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
         solutions: list[tuple[float, list[float]]] = []  # misfit and values
-        columns: dict[tuple[int, int], list[FloatArray]] = {}
-        for node in product(*(range(len(c)) for c in choices)):
-            for e, i in enumerate(node):
-                if (e, i) not in columns:
-                    columns[e, i] = self._columns(elements[e], choices[e][i])
-            shapes = [choices[e][i] for e, i in enumerate(node)]
-            sets = [columns[e, i] for e, i in enumerate(node)]
-            if all(sets):
-                solutions += self._solve(elements, shapes, sets)
+        forces: dict[tuple[int, int], list[FloatArray]] = {}
+        for index in product(*(range(len(c)) for c in choices)):
+            for e, i in enumerate(index):
+                if (e, i) not in forces:
+                    forces[e, i] = self._forces(elements[e], choices[e][i])
+            node = [choices[e][i] for e, i in enumerate(index)]
+            at_node = [forces[e, i] for e, i in enumerate(index)]
+            if all(at_node):
+                solutions += self._solve(elements, node, at_node)
         if not solutions:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
             solutions = [(0.0, values)]
@@ -200,7 +200,7 @@ class _Scan:
                     grids.append([unit * s for s in _LENGTHS])
         return grids
 
-    def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
+    def _forces(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
         """Return the force along each record; empty if a record has no motion at these values."""
         try:
             return [
@@ -213,8 +213,8 @@ class _Scan:
     def _solve(
         self,
         elements: tuple[Element, ...],
-        shapes: list[tuple[float, ...]],
-        sets: list[list[FloatArray]],
+        node: list[tuple[float, ...]],
+        forces: list[list[FloatArray]],
     ) -> list[tuple[float, list[float]]]:
         """Return the misfit and the values with the best linear parameters; empty if impossible.
 
@@ -223,8 +223,8 @@ class _Scan:
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
         normal = np.zeros((sum(scaled) + 1, sum(scaled) + 1))
         for i, history in enumerate(self.histories):
-            columns = [c[i] for c, s in zip(sets, scaled, strict=True) if s]
-            known = sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
+            columns = [f[i] for f, s in zip(forces, scaled, strict=True) if s]
+            known = sum(f[i] for f, s in zip(forces, scaled, strict=True) if not s)
             block = np.array([self._weighted(i, f) for f in (*columns, history.force - known)])
             normal += np.real(block.conj() @ block.T)
         if not np.isfinite(normal).all():
@@ -233,23 +233,23 @@ class _Scan:
         matrix = normal[:-1, :-1] / np.outer(size, size)
         right = normal[:-1, -1] / size
         solution = _non_negative(matrix, right) if right.size else right
-        values = self._values(elements, shapes, scaled, solution / size)
+        values = self._values(elements, node, scaled, solution / size)
         misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
         return [] if values is None else [(float(misfit), values)]
 
     @staticmethod
     def _values(
         elements: tuple[Element, ...],
-        shapes: list[tuple[float, ...]],
+        node: list[tuple[float, ...]],
         scaled: list[bool],
         solution: FloatArray,
     ) -> list[float] | None:
         """Return the free values, scaled by the solution; None if one is impossible."""
         factors = iter(solution)
         values: list[float] = []
-        for element, shape, scales in zip(elements, shapes, scaled, strict=True):
+        for element, at_node, scales in zip(elements, node, scaled, strict=True):
             factor = float(next(factors)) if scales else 1.0
-            rows = zip(element.labels, element.parameters, shape, strict=True)
+            rows = zip(element.labels, element.parameters, at_node, strict=True)
             for label, parameter, value in rows:
                 if not parameter.free:
                     continue

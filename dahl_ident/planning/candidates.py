@@ -23,7 +23,6 @@ from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.question import BenchLimits, PlanRequest, limit
 from dahl_ident.planning.trajectories import PlannedMotion
 
-CONTROLLED = ("displacement", "force")
 _CERTAIN = 0.95  # fraction of the draws that must stay within a limit
 _FREQUENCIES = 12  # most frequencies: six in each decade of the default range
 _BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee, if no limit is given

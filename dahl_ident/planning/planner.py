@@ -9,11 +9,11 @@ from typing import Any, cast
 import numpy as np
 
 from dahl_ident.arrays import non_negative_array, positive_number, whole_number
-from dahl_ident.data.columns import one_of
+from dahl_ident.data.columns import CONTROLLED, one_of
 from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import STEADY, Steady
 from dahl_ident.errors import ValidationError, argument
-from dahl_ident.planning.candidates import CONTROLLED, evaluate
+from dahl_ident.planning.candidates import evaluate
 from dahl_ident.planning.design import Design
 from dahl_ident.planning.forecast import SEARCHED
 from dahl_ident.planning.knowledge import Ranges, gather

@@ -57,7 +57,6 @@ class Trapezoid:
     dwell: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("stroke", "speed", "acceleration"):
             positive_number(getattr(self, name), f"{name} of a trapezoid")
         non_negative_array(self.dwell, "dwell of a trapezoid")
@@ -131,7 +130,6 @@ class Multisine:
     peak: float
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("lowest_hz", "highest_hz", "peak"):
             positive_number(getattr(self, name), f"{name} of a multisine")
         if self.highest_hz < self.lowest_hz:

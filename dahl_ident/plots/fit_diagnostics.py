@@ -241,12 +241,7 @@ def plot_information(
 
 
 @style.house_style()
-def plot_budget(
-    rows: Sequence[tuple[str, str, float]],
-    *,
-    x_label: str = "share of the variance [%]",
-    ax: Axes | None = None,
-) -> Axes:
+def plot_budget(rows: Sequence[tuple[str, str, float]], *, ax: Axes | None = None) -> Axes:
     """Draw the contributions to each parameter's variance as a stacked bar.
 
     Parameters
@@ -254,8 +249,6 @@ def plot_budget(
     rows : sequence of (parameter, source, share)
         Shares between 0 and 1; those of one parameter sum to 1. Parameters and sources are drawn in
         the order in which they first appear.
-    x_label : str
-        Axis label.
 
     Examples
     --------
@@ -298,7 +291,8 @@ def plot_budget(
                     bbox={"fc": "white", "ec": "none", "pad": 1.0},
                 )
         ends += widths
-    axis.set(xlabel=x_label, xlim=(0.0, 100.0), ylim=(len(parameters) - 0.4, -0.6))
+    axis.set(xlim=(0.0, 100.0), ylim=(len(parameters) - 0.4, -0.6))
+    axis.set_xlabel("share of the variance [%]")
     axis.set_yticks(range(len(parameters)), parameters)
     axis.grid(visible=False, axis="y")
     axis.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)

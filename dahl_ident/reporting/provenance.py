@@ -195,8 +195,11 @@ def _fit(fit: FitResult) -> list[str]:
         *_model(fit.problem),
         "--noise",
         fit.noise,
-        *_changed(method=(fit.method, "lm"), loss=(fit.optimum.loss, "linear")),
-        *_changed(steady=(fit.problem.steady, "exact")),
+        *_changed(
+            method=(fit.method, "lm"),
+            loss=(fit.optimum.loss, "linear"),
+            steady=(fit.problem.steady, "exact"),
+        ),
     ]
 
 

@@ -404,7 +404,7 @@ def _fit_facts(fit: FitResult) -> dict[str, Any]:
                 "fixed": not e.vary and name not in fit.assumed,
                 "assumed": name in fit.assumed,
                 "interval_95.45": list(intervals[name][1:]) if name in intervals else None,
-                "verdict": fit.verdict_on(name)[0].value if name in judged else None,
+                "verdict": judged[name].verdict.value if name in judged else None,
             }
             for name, e in fit.params.items()
         },

@@ -43,14 +43,14 @@ def answer(fit: FitResult) -> TextTable:
         lower, upper = limits[name].lower, limits[name].upper
         known, meaning = True, _ASSUMED
         if not is_assumed:
-            verdict, meaning = fit.verdict_on(name)
-            known = verdict.known
+            judged = fit.identifiability.parameters[name]
+            known, meaning = judged.verdict.known, judged.reason
             if known and not described:
                 meaning = "the model does not describe the data: the interval is not valid"
             elif known and fit.status is VerdictStatus.APPROXIMATE:
-                meaning = f"{verdict.value}; u includes the misfit"
+                meaning = f"{judged.verdict.value}; u includes the misfit"
             elif known:
-                meaning = verdict.value
+                meaning = judged.verdict.value
         struck = not (known and described)
         # for an undetermined parameter a one-sided limit is valid, a closed interval is not
         closed = bool(np.isfinite([lower, upper]).all())

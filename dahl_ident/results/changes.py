@@ -102,7 +102,8 @@ def headline(changed: list[Change]) -> list[str]:
 
 def is_usable(fit: FitResult, name: str) -> bool:
     """Return whether the uncertainty of a parameter is valid."""
-    return fit.verdict_on(name)[0].known and fit.status is not VerdictStatus.NOT_DESCRIBED
+    known = fit.identifiability.parameters[name].verdict.known
+    return known and fit.status is not VerdictStatus.NOT_DESCRIBED
 
 
 def _change(name: str, before: str, earlier: FitResult, after: str, later: FitResult) -> Change:

@@ -31,7 +31,7 @@ from dahl_ident.diagnostics.intervals import (
 )
 from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.diagnostics.record_assessment import RecordAssessment
-from dahl_ident.diagnostics.verdicts import Identifiability, Verdict
+from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum
@@ -158,11 +158,6 @@ class FittedModel(Result):
         Assumed exponents of tables have their estimates, so that the values together are a model.
         """
         return Parameters.of(self.problem, *self.assessment.known)
-
-    def verdict_on(self, name: str) -> tuple[Verdict, str]:
-        """Return whether the data determine a parameter, and what they show, in words."""
-        known = self.identifiability.parameters[name]
-        return known.verdict, known.reason
 
     @cached_property
     def best_fit(self) -> Any:

@@ -108,7 +108,7 @@ class Posterior(Result):
     )
     priors: Mapping[str, str] = part("_density.priors", "Every prior in words.")
     counted: tuple[str, ...] = part("_density.counted", "The sources of error that are counted.")
-    normalised: bool = part("_density.normalised", "Whether there is an evidence: not of records.")
+    normalised: bool = part("_density.normalised", "Whether there is an evidence; for records there is none.")
     converged: bool = part("sample.converged", "Whether the numbers can be used.")
     message: str = part(
         "sample.message", "Whether the numbers can be used, and what is missing if not."
@@ -391,9 +391,9 @@ class Posterior(Result):
     def judgement(self) -> Judgement:
         """Every finding about the posterior, and the status that follows from them.
 
-        Not determined if it has not converged, or a default prior sets a parameter, or one is known
-        to no better than a factor of seven either way; not described
-        if data and model or prior contradict each other; approximate if the fit is.
+        Not determined if it has not converged, a default prior sets a parameter, or a parameter is
+        known to no better than a factor of seven; not described if the data contradict the model or
+        a prior; approximate if the fit is.
         """
         return Judgement([*self._objections(), *self._notes(), *reading(self)])
 
@@ -587,7 +587,7 @@ class Posterior(Result):
         return [f"{name} [{unit}]" if unit else name for name, unit in pairs]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return verdict, numbers and priors as plain data; draws are not included."""
+        """Return verdict, numbers and priors as plain data, without the draws."""
         return {
             "schema": SCHEMA,
             "schema_version": 1,
