@@ -108,7 +108,7 @@ class Posterior(Result):
     )
     priors: Mapping[str, str] = part("_density.priors", "Every prior in words.")
     counted: tuple[str, ...] = part("_density.counted", "The sources of error that are counted.")
-    normalised: bool = part("_density.normalised", "Whether there is an evidence; for records there is none.")
+    normalised: bool = part("_density.normalised", "Whether it has an evidence; records have none.")
     converged: bool = part("sample.converged", "Whether the numbers can be used.")
     message: str = part(
         "sample.message", "Whether the numbers can be used, and what is missing if not."
