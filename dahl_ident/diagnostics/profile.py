@@ -154,8 +154,15 @@ class Profiler:
         P, L = self._problem.n_reported, len(thresholds)
         ends = np.stack([np.full((L, P), -np.inf), np.full((L, P), np.inf)])
         side, level, index = (a.ravel() for a in np.indices((2, L, P)))
-        search = np.flatnonzero(~self._open[side, index])
-        if np.isfinite(self._scale) and np.isfinite(thresholds).all() and search.size:
+        is_open = self._open[side, index]
+        known = bool(np.isfinite(self._scale) and np.isfinite(thresholds).all())
+        if known and self._problem.response is None:  # of records
+            far = np.zeros((2, L, P), dtype=np.bool_)
+            positive = np.flatnonzero(self._logarithmic[:P])
+            far[..., positive] = self.open_sides(positive, thresholds)
+            is_open = is_open | far.ravel()
+        search = np.flatnonzero(~is_open)
+        if known and search.size:
             ends[side[search], level[search], index[search]] = self._ends(
                 index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
             )
