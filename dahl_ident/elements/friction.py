@@ -242,9 +242,12 @@ class Friction(Element):
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return upper bounds of abs(N) and A abs(N), from the slopes and the forces of slip.
 
-        The fundamental of a wave of height 1 is at most 4/pi, that of the square wave.
+        The fundamental of a wave of height 1 is at most 4/pi, that of the square wave. Infinite for
+        a law that depends on the rate: its slopes and forces are only known near rest.
         """
         highest = np.maximum(*self.force_limits(values))
+        if not self.rate_independent:
+            highest = np.full_like(highest, np.inf)
         force = np.where(np.isfinite(highest), highest, 0.0)[..., None] * np.linspace(-1, 1, 101)
         columns = [np.asarray(v)[..., None] for v in values]
         slopes = [self.quasi_static_slope(force, s, columns).max(axis=-1) for s in (1.0, -1.0)]
