@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dahl_ident.arrays import SMALLEST, FloatArray
-from dahl_ident.elements import Element, LinearSystem
+from dahl_ident.elements import Element, LinearSystem, Parameter
 from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import FitError, ModelError, argument
 from dahl_ident.problem.record_noise import in_band
@@ -98,7 +98,7 @@ class _Scan:
     """The scan of a problem's nonlinear parameters, with the fastest part of each record."""
 
     def __init__(self, problem: RecordProblem) -> None:
-        self.problem = problem
+        self.problem, self.elements = problem, problem.model.elements
         self.histories = [self._history(i) for i in range(len(problem.records))]
         positions = [h.displacement for h in self.histories]
         x = np.concatenate([x - x.mean() for x in positions])
@@ -129,8 +129,7 @@ class _Scan:
 
     def starts(self) -> list[list[float]]:
         """Return the free values at the best starts that differ."""
-        elements = self.problem.model.elements
-        choices = [list(product(*self.grids(e))) for e in elements]
+        choices = [list(product(*self.grids(e))) for e in self.elements]
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
@@ -139,11 +138,11 @@ class _Scan:
         for index in product(*(range(len(c)) for c in choices)):
             for e, i in enumerate(index):
                 if (e, i) not in forces:
-                    forces[e, i] = self._forces(elements[e], choices[e][i])
+                    forces[e, i] = self._forces(self.elements[e], choices[e][i])
             node = [choices[e][i] for e, i in enumerate(index)]
             at_node = [forces[e, i] for e, i in enumerate(index)]
             if all(at_node):
-                solutions += self._solve(elements, node, at_node)
+                solutions += self._solve(node, at_node)
         if not solutions:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
             solutions = [(0.0, values)]
@@ -211,16 +210,13 @@ class _Scan:
             return []
 
     def _solve(
-        self,
-        elements: tuple[Element, ...],
-        node: list[tuple[float, ...]],
-        forces: list[list[FloatArray]],
+        self, node: list[tuple[float, ...]], forces: list[list[FloatArray]]
     ) -> list[tuple[float, list[float]]]:
         """Return the misfit and the values with the best linear parameters; empty if impossible.
 
         They are not negative, so that a plant with these values has a finite motion.
         """
-        scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
+        scaled = [any(self._scales(e, p) for p in e.parameters) for e in self.elements]
         normal = np.zeros((sum(scaled) + 1, sum(scaled) + 1))
         for i, history in enumerate(self.histories):
             columns = [f[i] for f, s in zip(forces, scaled, strict=True) if s]
@@ -233,21 +229,17 @@ class _Scan:
         matrix = normal[:-1, :-1] / np.outer(size, size)
         right = normal[:-1, -1] / size
         solution = _non_negative(matrix, right) if right.size else right
-        values = self._values(elements, node, scaled, solution / size)
+        values = self._values(node, scaled, solution / size)
         misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
         return [] if values is None else [(float(misfit), values)]
 
-    @staticmethod
     def _values(
-        elements: tuple[Element, ...],
-        node: list[tuple[float, ...]],
-        scaled: list[bool],
-        solution: FloatArray,
+        self, node: list[tuple[float, ...]], scaled: list[bool], solution: FloatArray
     ) -> list[float] | None:
         """Return the free values, scaled by the solution; None if one is impossible."""
         factors = iter(solution)
         values: list[float] = []
-        for element, at_node, scales in zip(elements, node, scaled, strict=True):
+        for element, at_node, scales in zip(self.elements, node, scaled, strict=True):
             factor = float(next(factors)) if scales else 1.0
             rows = zip(element.labels, element.parameters, at_node, strict=True)
             for label, parameter, value in rows:
@@ -264,14 +256,11 @@ class _Scan:
         return values
 
     @staticmethod
-    def _scales(element: Element, index: int) -> bool:
+    def _scales(element: Element, parameter: Parameter) -> bool:
         """Return whether a parameter is free, without a value, and scales the element's force."""
-        parameter, label = element.parameters[index], element.labels[index]
-        return bool(
-            parameter.free
-            and parameter.value is None
-            and (label in element.linear_parameters or label in element.scale_parameters)
-        )
+        scaling = (*element.linear_parameters, *element.scale_parameters)
+        unknown = bool(parameter.free) and parameter.value is None
+        return unknown and element.label(parameter) in scaling
 
     def _weighted(self, number: int, force: FloatArray) -> FloatArray:
         """Return a force as weighted in residuals: detrended, or as motion within the band."""

@@ -227,14 +227,15 @@ class BenchTime:
             return cls(f, np.zeros(f.size), size, **costs, least_settling=0)
         model, omega, values = knowledge.model, 2.0 * np.pi * f, knowledge.model_values()
         A = np.where(np.isfinite(candidates.amplitude), candidates.amplitude, 1.0)
-        decay = np.asarray(model.transient_decay(values, A, omega + 0.0 * A))
+        omega = np.broadcast_to(omega, A.shape)
+        decay = np.asarray(model.transient_decay(values, A, omega))
         if candidates.controlled == "force":
             decay, force = np.maximum(decay, _ring_down(model, values, A, omega)), candidates.force
         else:
             force = np.zeros(A.shape)
             for element, numbers in model.of(values):
                 if element.has_memory:
-                    force = force + A * np.abs(element.stiffness(numbers, A, omega + 0.0 * A))
+                    force = force + A * np.abs(element.stiffness(numbers, A, omega))
         return cls(f, np.quantile(decay, _QUANTILE, axis=0), np.median(force, axis=0), **costs)
 
     def order(self, levels: Sequence[int] | IntArray) -> IntArray:
@@ -282,9 +283,8 @@ def _ring_down(
 
     It is exp(-pi Im Z/(m omega^2)) with the mass m = -d Re Z/d(omega^2), at the steady amplitude.
     """
-    w = omega + 0.0 * A
-    Z = model.stiffness(values, A, w)
-    up, down = (model.stiffness(values, A, w * (1.0 + s)).real for s in (_STEP, -_STEP))
+    Z = model.stiffness(values, A, omega)
+    up, down = (model.stiffness(values, A, omega * (1.0 + s)).real for s in (_STEP, -_STEP))
     inertia = np.maximum(-(up - down) / (4.0 * _STEP), 0.0)  # m omega^2
     with np.errstate(divide="ignore", over="ignore"):
         rate = np.where(inertia > 1e-9 * np.abs(Z), np.maximum(Z.imag, 0.0) / inertia, np.inf)
