@@ -36,6 +36,7 @@ from dahl_ident.arrays import TINY, BoolArray, ComplexArray, FloatArray, IntArra
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import DRIVE_FACTOR, EXPONENT
 from dahl_ident.diagnostics.information import NOTICED, Basis
+from dahl_ident.elements import Model
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, limits
 from dahl_ident.fitting.losses import Loss, loss_named
@@ -95,13 +96,22 @@ class Assumption(NamedTuple):
     std: float  # standard uncertainty of the logarithm
 
 
-def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumption]]:
-    """Return the problem with free assumed exponents and drive factor, and their uncertainties."""
-    assumed = {
-        p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
-        for p in problem.model.parameters
+def assumed_exponents(model: Model) -> dict[str, float]:
+    """Return the standard uncertainty of the logarithm of each assumed exponent, by name.
+
+    Its range is taken as a uniform distribution of the logarithm.
+    """
+    return {
+        p.name: float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0))
+        for p in model.parameters
         if p.assumed and not p.free and p.prior is not None
     }
+
+
+def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumption]]:
+    """Return the problem with free assumed exponents and drive factor, and their uncertainties."""
+    exponents = assumed_exponents(problem.model)
+    assumed = {name: Assumption(EXPONENT, std) for name, std in exponents.items()}
     u = problem.data.drive_factor_uncertainty
     gain = next(p for p in problem.sensors.parameters if p.name == GAIN)
     if u and not gain.free:

@@ -16,6 +16,7 @@ from dahl_ident.arrays import FloatArray, IntArray, finite_array
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import NOISE, RUNS, excess
 from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.estimate import assumed_exponents
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.elements.element import as_model
@@ -339,12 +340,8 @@ def _stated(source: Any, parameters: Sequence[Parameter]) -> FloatArray:
 
 
 def _with_assumed(model: Model) -> tuple[Model, dict[str, float]]:
-    """Return the model with its assumed parameters free, and the information of each."""
-    assumed = {
-        p.name: 12.0 / np.log(p.prior[1] / p.prior[0]) ** 2
-        for p in model.parameters
-        if p.assumed and not p.free and p.prior is not None
-    }
+    """Return the model with its assumed exponents free, and the information of their ranges."""
+    assumed = {name: std**-2 for name, std in assumed_exponents(model).items()}
     return (model.with_free(assumed) if assumed else model), assumed
 
 
