@@ -111,7 +111,9 @@ class TestSign:
         assert f"With the response {turn.name} the misfit falls from " in wrong.statements[0]
         assert f"to {100.0 * right.rms_misfit:.2g} % rms: check " in wrong.statements[0]
         assert "Do not use the numbers of this fit" in wrong.statements[0]
-        assert wrong.fit_report().count(wrong.goodness.sign) == 1
+        report = wrong.fit_report()
+        assert report.count(wrong.goodness.sign) == 1
+        assert "Other models" not in report  # each would be fitted to the wrong sign
         assert not wrong.trusted
         assert right.sign == ""
 

@@ -230,7 +230,7 @@ def _print(result: Any, *, verbose: bool, compare: bool, of_records: bool) -> No
     from dahl_ident.diagnostics.comparison import compare_models
 
     console.write_wrapped(result.fit_report(details=verbose), result.status)
-    if compare and (result.goodness.acceptable or not verbose):  # otherwise already printed
+    if compare and not (verbose and result.goodness.asks_for_models):  # else already printed
         console.write(str(compare_models(result)))
     if not verbose:
         details = "further findings, tests of the residuals, other models and the solver's numbers"

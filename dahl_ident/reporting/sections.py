@@ -318,7 +318,7 @@ def _parameters(fit: FitResult, posteriors: Sequence[Posterior]) -> Iterator[Blo
 def _goodness(fit: FitResult) -> Iterator[Block]:
     yield Bullets((*map(str, fit.judgement.supporting), *fit.goodness.details))
     yield tables.goodness(fit)
-    if not fit.goodness.acceptable:
+    if fit.goodness.asks_for_models:
         compared = compare_models(fit)
         yield Paragraph(f"Other models, for comparison. {compared.headline}")
         yield from tables.comparison(compared)

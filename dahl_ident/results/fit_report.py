@@ -80,7 +80,7 @@ def _sections(fit: FittedModel, intervals: ConfidenceIntervals) -> Iterator[_Sec
     robust = [] if loss == "linear" else [f"robust loss: {loss}"]
     yield "Noise", [*fit.assessment.noise_in_words, *robust]
     yield "Goodness of fit", fit.goodness.details or ["no test applies"]
-    if not fit.goodness.acceptable:
+    if fit.goodness.asks_for_models:
         yield "Other models, for comparison", str(compare_models(fit)).splitlines()
     yield "Solver", _solver(fit)
 
