@@ -356,3 +356,25 @@ class TestComparison:
 
 def test_plant_of_the_helpers_is_that_of_the_paper():
     assert [p.value for p in PLANT.parameters] == [0.1, 30.0, 1.0, 0.3, 0.24, 0.3]
+
+
+def test_two_frequencies_show_what_depends_on_the_rate():
+    slow, fast = table(seed=1), table(seed=2)
+    rising = np.concatenate([slow.response, 1.08 * fast.response])
+    f, A = np.repeat([1.0, 5.0], 30), np.tile(slow.amplitude, 2)
+    both = FrequencyResponse(f, rising, A)
+    (text,) = (str(t) for t in judge(both).of("trend") if "over frequency" in str(t))
+    rise = float(re.search(r"stiffness rises by (\S+)", text)[1])
+    assert rise == pytest.approx(8.0, abs=3.0)
+
+
+def test_two_mountings_that_differ_are_named():
+    data = table(n=30)
+    right = np.arange(30) % 2 == 1
+    mount = np.where(right, "right", "left")
+    differing = np.where(right, 1.0, 1.06) * data.response
+    (test,) = judge(replace(data, response=differing, quality={"mount": mount})).of("groups")
+    gains = re.findall(r"(\S+) % (below|above) the model at (left|right)", str(test))
+    assert [(side, name) for _, side, name in gains] == [("below", "right"), ("above", "left")]
+    assert sum(float(size) for size, *_ in gains) == pytest.approx(6.0, abs=1.0)
+    assert test.p_value < 1e-6

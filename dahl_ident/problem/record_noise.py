@@ -194,8 +194,8 @@ def travelled(displacement: FloatArray, noise: float, lead: float = LEADS[1]) ->
 
     Examples
     --------
-    >>> travelled(np.array([0.0, 1.0, -1.0, 9.0, 10.0, 9.0]), 1.0).tolist()
-    [0.0, 0.0, 0.0, 7.0, 8.0, 8.0]
+    >>> travelled(np.array([0.0, 1.0, -1.0, 4.5, 9.0, 10.0, 9.0]), 1.0).tolist()
+    [0.0, 0.0, 0.0, 2.5, 7.0, 8.0, 8.0]
     """
     half, ahead = _HALF_BAND * noise, lead * noise
     middle, place, path = float(displacement[0]), float(displacement[0]), []
