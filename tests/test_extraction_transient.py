@@ -138,3 +138,19 @@ def test_settling_periods_are_left_out_by_themselves():
     assert left_out[2] > left_out[1] > 0
     errors = np.abs(data.response - FRICTION.describing_function(data.amplitude))
     assert (errors < 4.0 * np.sqrt(np.trace(data.covariance, axis1=1, axis2=2))).all()
+
+
+def test_noise_over_two_cycles_is_not_taken_for_a_transient():
+    """One spectral line below the fundamental may be small by chance; the residuals are not."""
+    t = np.arange(80) / 40.0
+    x = 3e-3 * np.sin(2.0 * np.pi * t)
+    force = FRICTION.force(np.tile(x, 20))[-80:]
+    exact, noise = complex(FRICTION.describing_function(3e-3)), 0.045 * np.abs(force).max()
+    rng, errors = np.random.default_rng(5), []
+    for _ in range(150):
+        noisy = force + noise * rng.standard_normal(80)
+        record = Record(t, displacement=x, force=noisy)
+        found = extract(record, harmonics=[1], frequency=1.0, settling_periods=0)
+        errors.append(found.response[0] - exact)
+    rms = float(np.sqrt(np.mean(np.abs(errors) ** 2)))
+    assert rms == pytest.approx(2.0 * noise / np.sqrt(80.0) / 3e-3, rel=0.25)

@@ -103,14 +103,19 @@ def estimate_transient(
     cycles = max(2, round(float(angle[-1]) / (2.0 * np.pi)))
     p = np.arange(1.0, min(cycles, _SLOW_LINES + 1))  # the lines p/T below the fundamental
     tones = powers(np.exp(-1j / cycles * angle), p.size)[1:]
-    content = tones @ (y - steady.T @ (steady @ y))
+    remaining = y - steady.T @ (steady @ y)
+    content = tones @ remaining
 
     def variance_of(departure: float, decay: FloatArray, estimator: FloatArray) -> float:
-        """Return the variance of white noise with the same effect on ``estimator @ y``."""
+        """Return the variance of white noise with the same effect on ``estimator @ y``.
+
+        It is no less than that of the residuals: a few lines may be small by chance.
+        """
         power = np.abs(tones @ estimator) ** 2
         noise = np.abs(content - departure * (tones @ decay)) ** 2
         level = float(np.mean(p * noise)) / decay.size
-        return max(level * float(np.sum(power / p) / np.sum(power)), TINY)
+        white = np.sum((remaining - departure * decay) ** 2) / max(y.size - len(steady) - 2, 1)
+        return max(level * float(np.sum(power / p) / np.sum(power)), float(white), TINY)
 
     rates = _FIRST_RATES
     friction_rates, phases = _friction_phases()
