@@ -236,6 +236,13 @@ class TestReport:
         upper = result.conf_interval(levels=0.95)["f_max"][0].upper
         assert upper == result.conf_interval(levels=(0.95,))["f_max"][0].upper
 
+    def test_a_plant_is_compared_on_request_alone(self):
+        """Each other model would take as long as the fit, or longer."""
+        plant = di.Dahl() + di.Mass(0.3) + di.Damper() + di.Spring()
+        wrong = fit(di.load_dataset("frf_levels"), plant, throw=False)
+        assert not wrong.goodness.acceptable
+        assert "Other models" not in str(wrong)
+
     def test_a_wrong_model_is_compared_with_others(self):
         wrong = fit(table(model=FRICTION + di.Spring(1.0)), di.Dahl())
         assert not wrong.trusted

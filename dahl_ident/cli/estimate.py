@@ -227,10 +227,10 @@ def fit(
 
 
 def _print(result: Any, *, verbose: bool, compare: bool, of_records: bool) -> None:
-    from dahl_ident.diagnostics.comparison import compare_models
+    from dahl_ident.diagnostics.comparison import compare_models, is_compared
 
     console.write_wrapped(result.fit_report(details=verbose), result.status)
-    if compare and not (verbose and result.goodness.asks_for_models):  # else already printed
+    if compare and not (verbose and is_compared(result)):  # else already printed
         console.write(str(compare_models(result)))
     if not verbose:
         details = "further findings, tests of the residuals, other models and the solver's numbers"

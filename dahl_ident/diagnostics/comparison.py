@@ -397,6 +397,16 @@ def _change(value: float, before: float) -> str:
     return percent(ratio, sign=True)
 
 
+def is_compared(fit: Any) -> bool:
+    """Return whether a report compares a fit with other models.
+
+    It does if another model may describe the residuals, which none does with a wrong sign, unless
+    motions are exact: then it takes minutes.
+    """
+    goodness = fit.goodness
+    return not (goodness.acceptable or goodness.sign or fit.problem.is_exact)
+
+
 def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> ModelComparison:
     """Fit other models to the same data and compare how they predict tests left out.
 

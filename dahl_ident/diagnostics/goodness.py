@@ -125,11 +125,6 @@ class Goodness:
         return not self.objections and not self.flagged and self.judged
 
     @property
-    def asks_for_models(self) -> bool:
-        """Whether another model may describe the residuals; with a wrong sign, none does."""
-        return not (self.acceptable or self.sign)
-
-    @property
     def judged(self) -> bool:
         """Whether the data test the model, and distinguish a wrong one from noise."""
         return not self.untested and self._enough_points

@@ -13,7 +13,7 @@ from typing import Any
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.budget import Budget
-from dahl_ident.diagnostics.comparison import compare_models
+from dahl_ident.diagnostics.comparison import compare_models, is_compared
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
@@ -318,7 +318,7 @@ def _parameters(fit: FitResult, posteriors: Sequence[Posterior]) -> Iterator[Blo
 def _goodness(fit: FitResult) -> Iterator[Block]:
     yield Bullets((*map(str, fit.judgement.supporting), *fit.goodness.details))
     yield tables.goodness(fit)
-    if fit.goodness.asks_for_models:
+    if is_compared(fit):
         compared = compare_models(fit)
         yield Paragraph(f"Other models, for comparison. {compared.headline}")
         yield from tables.comparison(compared)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from dahl_ident.diagnostics.comparison import compare_models
+from dahl_ident.diagnostics.comparison import compare_models, is_compared
 from dahl_ident.diagnostics.confidence_levels import level_text
 from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
@@ -80,7 +80,7 @@ def _sections(fit: FittedModel, intervals: ConfidenceIntervals) -> Iterator[_Sec
     robust = [] if loss == "linear" else [f"robust loss: {loss}"]
     yield "Noise", [*fit.assessment.noise_in_words, *robust]
     yield "Goodness of fit", fit.goodness.details or ["no test applies"]
-    if fit.goodness.asks_for_models:
+    if is_compared(fit):
         yield "Other models, for comparison", str(compare_models(fit)).splitlines()
     yield "Solver", _solver(fit)
 
