@@ -29,6 +29,18 @@ def test_an_assumed_exponent_counts_as_if_it_were_estimated():
     assert "Assumed: alpha = 1 exactly" in given.verdict
 
 
+def test_limits_of_an_assumed_exponent_are_within_its_range():
+    t = np.arange(1500) / 500.0
+    x = 1.5e-3 * np.sin(7.0 * t) * np.sin(1.3 * t)
+    force = di.Dahl(0.1, 30.0).force(x) + 4e-3 * np.random.default_rng(1).standard_normal(t.size)
+    record = di.fit(di.Record(t, displacement=x, force=force), di.Dahl())
+    table = di.fit(di.load_dataset("microslip"), di.Dahl())
+    for fit in (record, table):
+        limits = [(low, high) for _, low, high in fit.conf_interval()["alpha"]]
+        assert limits[-1] == pytest.approx((0.5, 2.0))
+        assert all(0.5 <= low < high <= 2.0 for low, high in limits)
+
+
 def assert_alike(one, other, names, share):
     """Check that values and standard uncertainties differ by a share of the uncertainty."""
     for name in names:

@@ -164,7 +164,7 @@ def combined_intervals(
 
     For a positive parameter whose u is above 20 %, the limits are value exp(-+ k u/value). For one
     with an open side, they are those of the profile, widened by the other sources. Assumed
-    parameters come after those that were fitted.
+    parameters come after those that were fitted, within their ranges.
     """
     array, every = checked_levels(levels), errors.problem
     estimates, directions = every.to_values(errors.theta), np.eye(len(errors.names))
@@ -205,7 +205,14 @@ def combined_intervals(
     note = f"every source of the budget: {law}"
     assumed = [name for name in errors.assumed if errors.holds(name)]
     also = [errors.names.index(name) for name in assumed]
-    lower, upper = np.hstack([lower, low[:, also]]), np.hstack([upper, high[:, also]])
+    ranges = {p.name: p.prior for p in optimum.problem.model.parameters if p.assumed and p.prior}
+    low, high = within_ranges(
+        low[:, also],
+        high[:, also],
+        estimates[also],
+        [ranges.get(name, (-np.inf, np.inf)) for name in assumed],
+    )
+    lower, upper = np.hstack([lower, low]), np.hstack([upper, high])
     units = tuple(
         p.unit for p in (*optimum.problem.parameters, *(every.parameters[i] for i in also))
     )
@@ -250,6 +257,20 @@ def around(
             for sign in (-1.0, 1.0)
         )
     return np.maximum(lower, least), np.minimum(upper, most)
+
+
+def within_ranges(
+    lower: FloatArray,
+    upper: FloatArray,
+    values: FloatArray,
+    ranges: Sequence[tuple[float, float]],
+) -> tuple[FloatArray, FloatArray]:
+    """Return limits within the assumed ranges; an estimate beyond an end keeps its limit there."""
+    least, most = np.reshape(ranges, (-1, 2)).T
+    return (
+        np.where(values > least, np.maximum(lower, least), lower),
+        np.where(values < most, np.minimum(upper, most), upper),
+    )
 
 
 def intervals_from_search(

@@ -27,7 +27,7 @@ from dahl_ident.diagnostics.confidence_levels import (
 from dahl_ident.diagnostics.contributions import ALONG_MOTION, MODEL_ERROR, NOISE, variances
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.goodness import Goodness
-from dahl_ident.diagnostics.intervals import LARGE, ConfidenceIntervals, around
+from dahl_ident.diagnostics.intervals import LARGE, ConfidenceIntervals, around, within_ranges
 from dahl_ident.diagnostics.misfit_explanations import force_convention
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.diagnostics.record_errors import (
@@ -267,6 +267,12 @@ class RecordAssessment(Assessment):
         ln_u = np.array([p.std for p in assumed])
         ln_U = coverage_factors(self.errors.least_dof, array[:, None]) * ln_u
         assumed_values = np.array([p.value for p in assumed])
+        low, high = within_ranges(
+            assumed_values * np.exp(-ln_U),
+            assumed_values * np.exp(ln_U),
+            assumed_values,
+            [p.range for p in assumed],
+        )
         note = f"every source of the budget, {self.errors.effective:.0f} effective samples"
         return ConfidenceIntervals(
             "combined",
@@ -274,8 +280,8 @@ class RecordAssessment(Assessment):
             (*self.problem.names, *(p.name for p in assumed)),
             (*(p.unit for p in self.problem.parameters), *(p.unit for p in assumed)),
             np.append(values, assumed_values),
-            np.hstack([lower, assumed_values * np.exp(-ln_U)]),
-            np.hstack([upper, assumed_values * np.exp(ln_U)]),
+            np.hstack([lower, low]),
+            np.hstack([upper, high]),
             note,
         )
 
