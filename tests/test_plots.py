@@ -473,3 +473,11 @@ def test_residuals_of_a_fit_over_amplitude_frequency_and_velocity():
         np.testing.assert_allclose(np.asarray(drawn.get_xdata()), x)
     with pytest.raises(ValidationError, match="against is 'time'; expected one of amplitude"):
         fit.plot_residuals(against="time")
+
+
+def test_a_legend_of_long_names_leaves_the_axes_their_width():
+    levels = [(f"ForceControl[{i}]", [79.0, 80.0, 81.0], [1.0, 2.0 - 1.0j, 0.5]) for i in range(4)]
+    top, _ = plots.plot_frequency_response(levels)
+    top.figure.draw_without_rendering()
+    assert top.get_window_extent().width > 0.7 * top.figure.bbox.width
+    assert top.get_legend().get_window_extent().x1 < top.figure.bbox.x1

@@ -130,17 +130,20 @@ def level_names(labels: Sequence[str]) -> list[str | None]:
 
 
 def legend_above(axis: Axes) -> None:
-    """Put the legend above the axes, where it hides no data."""
+    """Put the legend above the axes, where it hides no data, in as many rows as it needs."""
     entries = len(axis.get_legend_handles_labels()[1])
     columns = entries if entries <= _MOST_IN_A_ROW else -(-entries // 2)
-    axis.legend(
-        ncols=columns,
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        borderaxespad=0.2,
-        columnspacing=1.0,
-        handletextpad=0.5,
-    )
+    for ncols in range(max(columns, 1), 0, -1):
+        legend = axis.legend(
+            ncols=ncols,
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            borderaxespad=0.2,
+            columnspacing=1.0,
+            handletextpad=0.5,
+        )
+        if legend.get_window_extent().width <= axis.bbox.width:
+            break
 
 
 def readable_log_ticks(axis: Axes) -> None:
