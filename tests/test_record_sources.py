@@ -392,6 +392,18 @@ def test_a_delay_of_a_driven_motion_is_estimated():
     assert_near(fit, (("f_max", 0.1), ("sigma", 300.0), ("damping", 0.5), ("stiffness", 50.0)), 4.0)
 
 
+@pytest.mark.parametrize("delay", [-2.0, 2.2])
+def test_a_delay_of_two_standard_deviations_is_removed(delay):
+    """The first of the steps that estimate it is too long by up to a half."""
+    clean = driven(3, 1e-3, 1024)
+    late = CubicSpline(clean.time, clean.displacement)(clean.time - delay / RATE)
+    model = di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Damper() + di.Spring()
+    stated = di.Sensors(delay=stats.norm(0.0, 1.0 / RATE))
+    fit = di.fit(replace(clean, displacement=late), model, sensors=stated)
+    assert fit.trusted, fit.verdict
+    assert_near(fit, (("f_max", 0.1), ("sigma", 300.0), ("damping", 0.5), ("stiffness", 50.0)), 4.0)
+
+
 @pytest.mark.parametrize("power", [0.02, 0.1])
 def test_friction_that_rises_a_little_with_speed_is_covered(power):
     fit = di.fit(held(DAHL, 1, power=power), di.Dahl())

@@ -34,8 +34,9 @@ _DESCRIBED = 0.1  # unexplained share of variance that shows a wrong model, not 
 _REWEIGHTINGS = 12  # most iterations of the weights
 _BANDS = 0.0, 1.0, 2.0, 4.0  # dead bands tried, in units of the noise that differences show
 _ALIGNED = 0.02  # part of the sum of squares that a delay has to explain to be removed
-_LONGEST_DELAY = 2.0  # times its standard deviation
-_ALIGNMENTS = 4  # most steps of the delay: each is a hundredth of the one before
+_LONGEST_DELAY = 2.0  # samples, if none is stated
+_FARTHEST_DELAY = 3.0  # standard deviations of a stated delay
+_ALIGNMENTS = 4  # most steps of the delay: small ones are a hundredth of the one before
 SLOW = 0.5  # correlation of neighbouring residuals above which they are weighted by their spectrum
 EXACT = 1e-12  # unexplained share of variance that is rounding
 LOOSE = 1e4  # factor of the step at which a search of a long record has converged
@@ -197,15 +198,16 @@ class RecordSearch:
         """Return the estimate with the delay between the channels that the residuals show.
 
         Steps of the delay are taken, with all values free, as long as each explains more than
-        chance. A delay is not removed, but counted as an uncertainty only, if it explains little or
-        the remaining residuals are not noise, because it may be due to a misfit; also if it is
-        longer than stated, or than that between channels sampled together, such as the effect of a
-        missing damper.
+        chance; the first may be too long. A delay is not removed, but counted as an uncertainty
+        only, if it explains little or the remaining residuals are not noise, because it may be due
+        to a misfit; also if it is longer than stated, or than that between channels sampled
+        together, such as the effect of a missing damper.
         """
         is_exact = unexplained(problem, plain) < EXACT
         if not plain.converged[0] or is_exact:
             return problem, plain
-        delayed, end = problem, plain
+        farthest = _FARTHEST_DELAY if "delay" in problem.calibration else _LONGEST_DELAY
+        delayed, end, longest = problem, plain, farthest * problem.delay_std
         for _ in range(_ALIGNMENTS):
             step, fall = self._delay_step(delayed, end.theta[0])
             residuals = delayed.split_residuals(delayed.to_values(end.theta[0]))
@@ -213,9 +215,10 @@ class RecordSearch:
             part = 0.0 if delayed.delay else _ALIGNED * 2.0 * float(end.cost[0])
             if not fall > max(chance, part):
                 break
-            if abs(delayed.delay + step) > _LONGEST_DELAY * problem.delay_std:
+            delay = float(np.clip(delayed.delay + step, -longest, longest))
+            if delay == delayed.delay:
                 return problem, plain
-            delayed = delayed.delayed(delayed.delay + step)
+            delayed = delayed.delayed(delay)
             end = self.descend(delayed, end.theta[0], STEPS)
             if not end.converged[0]:
                 return problem, plain
