@@ -291,6 +291,19 @@ def test_a_limit_that_no_motion_reaches_is_bounded_from_below(seed):
     assert_near(fit, {"sigma": 30.0}, 3.0)
 
 
+def test_an_exponent_without_slip_has_no_limits():
+    """Nor has f_max: its limits were 1e-223 and 1e217 N."""
+    t = np.arange(1000) / 200.0
+    x = 2e-6 * np.sin(np.pi * t) + 1e-6 * np.sin(0.62 * np.pi * t + 1.0)
+    noise = np.random.default_rng(0).standard_normal(1000)
+    record = di.Record(t, displacement=x, force=DAHL.force(x) + 1e-5 * noise)
+    fit = di.fit(record, di.Dahl(alpha=None), throw=False)
+    for name in ("f_max", "alpha"):
+        (interval,) = fit.conf_interval(levels=(0.9545,))[name]
+        assert (interval.lower, interval.upper) == (0.0, np.inf)
+    assert "f_max: anything (95.45 %); alpha: anything (95.45 %), not determined" in fit.verdict
+
+
 def test_a_displacement_that_is_constant_determines_nothing(tmp_path):
     t = np.arange(400) / 100.0
     force = 1e-3 * np.random.default_rng(0).standard_normal(400)

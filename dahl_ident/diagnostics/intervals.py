@@ -52,6 +52,7 @@ from dahl_ident.units import counted
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which limits are value * factor and value / factor
+_LARGEST_FACTOR = 1e8  # above it there is no limit
 LARGE = 0.1  # u of a logarithm from noise alone, above which a side may be open
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _DISAGREES = 0.2  # half widths between the limits of two methods
@@ -246,16 +247,17 @@ def around(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the limits value -+ k u within the bounds, each (L, P).
 
-    For a positive parameter whose u is above 20 %, they are value exp(-+ k u/value).
+    For a positive parameter whose u is above 20 %, they are value exp(-+ k u/value), and open where
+    that is a factor of 1e8.
     """
     least, most = (space.to_values(bound) for bound in space.bounds)
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         relative = np.where(space.positive, u / values, 0.0)
         by_factor = space.positive & ~(relative <= _BY_FACTOR)
-        lower, upper = (
-            np.where(by_factor, values * np.exp(sign * k * relative), values + sign * k * u)
-            for sign in (-1.0, 1.0)
-        )
+        factor = np.exp(k * relative)
+        factor = np.where(factor <= _LARGEST_FACTOR, factor, np.inf)
+        lower = np.where(by_factor, values / factor, values - k * u)
+        upper = np.where(by_factor, values * factor, values + k * u)
     return np.maximum(lower, least), np.minimum(upper, most)
 
 
