@@ -271,7 +271,13 @@ class TestBudget:
     def test_forms(self):
         found = budget(fit(table(n=12), Dahl()).optimum)
         assert "combined" in str(found)
-        assert json.loads(json.dumps(found.to_dict()))["parameters"]["f_max"]["u"] > 0.0
+        plain = json.loads(json.dumps(found.to_dict()))["parameters"]["f_max"]
+        assert plain["u"] > 0.0
+        dof = {row.source: row.dof for row in found["f_max"].rows}
+        known = {name: number for name, number in dof.items() if np.isfinite(number)}
+        assert known
+        stated = {row["source"]: row["dof"] for row in plain["sources"]}
+        assert stated == dict.fromkeys(dof) | known
         frame = found.to_frame()
         assert set(frame["source"]) >= {"noise", "combined"}
         numbers = found.numbers()
