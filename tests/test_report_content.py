@@ -262,6 +262,16 @@ def test_two_saved_fits_say_what_changed(run, fit):
     assert re.search(r"f_max from other to monday: .* N \(-100 %, p < 0", told.out)
 
 
+def test_fits_that_describe_nothing_say_nothing_of_changes(run):
+    for name in ("monday", "friday"):
+        wrong = di.fit(di.load_dataset("alpha_2"), di.Dahl(alpha=1.0))
+        assert wrong.status == "not described"
+        wrong.save(f"{name}.json")
+    told = run("fit", "monday.json", "friday.json").out
+    assert "Whether a parameter changes cannot be stated" in told
+    assert "No parameter changes" not in told
+
+
 def test_equal_devices_seldom_change_significantly(tmp_path):
     """At 5 %, 2 parameters of 15 pairs: more than 6 significant ones have probability 0.1 %."""
     fits, found = [di.fit(measured(0.1, seed), di.Dahl()) for seed in range(30)], []

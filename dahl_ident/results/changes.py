@@ -89,9 +89,14 @@ def changes(fits: Mapping[str, FitResult]) -> list[Change]:
 
 def headline(changed: list[Change]) -> list[str]:
     """Return sentences on what has changed, and on what the comparison leaves open."""
-    sentences = [f"{c}." for c in changed if math.isfinite(c.p) and c.p < SIGNIFICANT]
+    known = [c for c in changed if math.isfinite(c.p)]
+    sentences = [f"{c}." for c in known if c.p < SIGNIFICANT]
+    if not known:
+        return ["Whether a parameter changes cannot be stated: none is known in both fits."]
     if not sentences:
-        return ["No parameter changes significantly between the measurements."]
+        left_out = ", ".join(dict.fromkeys(c.parameter for c in changed if c not in known))
+        unknown = f"; of {left_out}, nothing can be stated" if left_out else ""
+        return [f"No parameter changes significantly between the measurements{unknown}."]
     if not all(c.runs_known for c in changed):
         sentences.append(
             "Each fit is of a single run, so scatter between runs (a new mounting, another day) "
