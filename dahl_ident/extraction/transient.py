@@ -36,6 +36,7 @@ _REFINEMENTS = 5  # times that the grid of rates is refined, each time five time
 _RATE_SPREAD = 1.0  # standard deviation of ln(rate) about the value derived from the phase
 _FADED = 28.0  # decay constants after which a departure of 1 is 1e-12
 _SLOW_LINES = 24  # spectral lines below the fundamental that give the noise of D_0
+_ENOUGH_LINES = 5  # that are not all small by chance
 MOST_CYCLES = 256  # cycles at most from which D_0 and the rate are estimated
 
 
@@ -109,13 +110,17 @@ def estimate_transient(
     def variance_of(departure: float, decay: FloatArray, estimator: FloatArray) -> float:
         """Return the variance of white noise with the same effect on ``estimator @ y``.
 
-        It is no less than that of the residuals: a few lines may be small by chance.
+        If the lines are few, they may be small by chance: it is then no less than that of the
+        residuals.
         """
         power = np.abs(tones @ estimator) ** 2
         noise = np.abs(content - departure * (tones @ decay)) ** 2
         level = float(np.mean(p * noise)) / decay.size
-        white = np.sum((remaining - departure * decay) ** 2) / max(y.size - len(steady) - 2, 1)
-        return max(level * float(np.sum(power / p) / np.sum(power)), float(white), TINY)
+        variance: float = max(level * float(np.sum(power / p) / np.sum(power)), TINY)
+        if p.size >= _ENOUGH_LINES:
+            return variance
+        residual = remaining - departure * decay
+        return max(variance, float(residual @ residual) / max(y.size - len(steady) - 2, 1))
 
     rates = _FIRST_RATES
     friction_rates, phases = _friction_phases()
