@@ -116,11 +116,12 @@ def estimate_transient(
         power = np.abs(tones @ estimator) ** 2
         noise = np.abs(content - departure * (tones @ decay)) ** 2
         level = float(np.mean(p * noise)) / decay.size
-        variance: float = max(level * float(np.sum(power / p) / np.sum(power)), TINY)
+        variance = max(level * float(np.sum(power / p) / np.sum(power)), TINY)
         if p.size >= _ENOUGH_LINES:
             return variance
         residual = remaining - departure * decay
-        return max(variance, float(residual @ residual) / max(y.size - len(steady) - 2, 1))
+        white = float(residual @ residual / max(y.size - len(steady) - 2, 1))
+        return max(variance, white)
 
     rates = _FIRST_RATES
     friction_rates, phases = _friction_phases()
