@@ -474,7 +474,7 @@ def test_an_exponent_stated_wrongly_is_not_described(alpha):
 
 @pytest.mark.parametrize("seed", [1, 7, 9, 11])
 def test_motion_that_hardly_slips_does_not_contradict_a_right_exponent(seed):
-    """The records ask for any exponent, far from the one stated, and hardly prefer it."""
+    """The search ends at an exponent far from the stated one, but hardly fits better."""
     t = np.arange(1000) / 200.0
     x = 1e-4 * np.sin(np.pi * t) + 6e-5 * np.sin(0.62 * np.pi * t + 1.0)
     noise = 2e-4 * np.random.default_rng(seed).standard_normal(t.size)

@@ -126,7 +126,9 @@ def measure(
     channel = settings.transient_channel
     transient = estimate_transient(rough, channel, float(np.angle(X)), response)
     steady = without(transient, first, settings)
-    settled = sine_fit(steady.thinned(), trend=sweep, most=HARMONICS)
+    settled = rough
+    if steady is not first:
+        settled = sine_fit(steady.thinned(), trend=sweep, most=HARMONICS)
     _check_share(settled, steady, settings, samples.lost_variance(first))
     dropped = 0 if sweep else settings.settling_periods or 0
     find_settling = settings.settling_periods is None and not sweep
