@@ -159,7 +159,7 @@ class Profiler:
         if known and self._problem.response is None:  # of records
             far = np.zeros((2, L, P), dtype=np.bool_)
             positive = np.flatnonzero(self._logarithmic[:P])
-            far[..., positive] = self.open_sides(positive, thresholds)
+            far[..., positive] = self.far_deviance(positive)[:, None] < thresholds[:, None] ** 2
             is_open = is_open | far.ravel()
         search = np.flatnonzero(~is_open)
         if known and search.size:
@@ -253,12 +253,12 @@ class Profiler:
         limited = np.clip(change, -_LONGEST_LOG_STEP, _LONGEST_LOG_STEP)
         return np.where(self._logarithmic & (change != moved[:, None]), limited, change)
 
-    def open_sides(self, index: IntArray, thresholds: FloatArray) -> BoolArray:
-        """Return on which sides the data allow a hundred times less or more, shape (2, L, n).
+    def far_deviance(self, index: IntArray) -> FloatArray:
+        """Return the deviance at a hundredth and at a hundred times the estimate, shape (2, n).
 
         `index` are n positive parameters. The others take Gauss-Newton steps without damping, along
         which first states and offsets, which are nearly interchangeable, follow. They are few, so
-        the deviance may be stated too large, and a side not as open.
+        the deviance may be too large, but is not too small.
         """
         theta = np.tile(self._optimum.theta, (2, index.size, 1))
         theta[:, np.arange(index.size), index] += np.array([[-_FAR], [_FAR]])
@@ -271,7 +271,7 @@ class Profiler:
             step = np.array([_step_of_others(*pair) for pair in pairs])
             rows = rows + np.where(self._logarithmic, np.clip(step, -1.0, 1.0), step)
         deviance = 2.0 * (least - self._least_cost) * self._stretch[held]
-        return np.asarray(deviance.reshape(2, 1, -1) < thresholds[:, None] ** 2)
+        return np.asarray(deviance.reshape(2, -1))
 
     # Constrained problems
 

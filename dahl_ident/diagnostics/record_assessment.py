@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import TINY, BoolArray, FloatArray, whole_number
+from dahl_ident.arrays import TINY, FloatArray, IntArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
 from dahl_ident.diagnostics.advice import record_advice
@@ -258,10 +258,10 @@ class RecordAssessment(Assessment):
         k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
         lower, upper = around(self.problem.space, values, u, k)
-        asked = np.flatnonzero(self._doubtful)
+        asked, deviance = self._far_deviance
         if asked.size:
-            noise = self.by_noise
-            below, above = Profiler(noise).open_sides(asked, thresholds(noise, array))
+            q = thresholds(self.by_noise, array)
+            below, above = deviance[:, None] < q[:, None] ** 2
             lower[:, asked] = np.where(below, 0.0, lower[:, asked])
             upper[:, asked] = np.where(above, np.inf, upper[:, asked])
         ln_u = np.array([p.std for p in assumed])
@@ -285,15 +285,16 @@ class RecordAssessment(Assessment):
             note,
         )
 
-    @property
-    def _doubtful(self) -> BoolArray:
-        """Which of the model's parameters may have an interval with an open side, (P,)."""
-        if self.first_order:
-            return np.zeros(0, dtype=np.bool_)
-        count = self.problem.n_reported
+    @cached_property
+    def _far_deviance(self) -> tuple[IntArray, FloatArray]:
+        """The parameters that may have an open side, (n,), and their deviances far off, (2, n)."""
+        count = 0 if self.first_order else self.problem.n_reported
         with np.errstate(divide="ignore"):
             u = np.sqrt(np.diagonal(self.errors.contributions[NOISE])) / self.optimum.values
-        return np.asarray(self.problem.space.positive & ~(u <= LARGE))[:count]
+        asked = np.flatnonzero((self.problem.space.positive & ~(u <= LARGE))[:count])
+        if not asked.size:
+            return asked, np.zeros((2, 0))
+        return asked, Profiler(self.by_noise).far_deviance(asked)
 
     @cached_property
     def identifiability(self) -> Identifiability:
