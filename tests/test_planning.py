@@ -309,6 +309,19 @@ class TestPlan:
         # what is missing is f_max: the plan goes where it shows
         assert max(step.level for step in after.steps) > 2.0 * X_C
 
+    def test_a_range_replaces_what_earlier_data_hardly_determine(self):
+        A, stiff = np.array([5e-6, 1e-5, 2e-5]), di.Dahl(100.0, 3e3, alpha=1.0) + di.Damper(5e3)
+        response = stiff.dynamic_stiffness(A, 2.0 * np.pi)
+        covariance = (0.02 * np.abs(response))[:, None, None] ** 2 * np.eye(2)
+        data = FrequencyResponse(np.ones(3), response, A, covariance=covariance)
+        fit = di.fit(data, di.Dahl(alpha=1.0) + di.Damper(), throw=False)
+        limits = {"frequency_hz": (0.1, 3.0), "time": 200.0, "displacement": (1e-5, 0.05)}
+        with pytest.raises(ValidationError, match="does not determine f_max; give ranges="):
+            di.plan(fit, limits=limits, draws=10)
+        plan = di.plan(fit, limits=limits, draws=10, ranges={"f_max": (10.0, 1e3)})
+        assert plan.expected["f_max"].after < 0.2
+        assert ((plan.search.forecast.knowledge.values[:, 0] / 100.0) ** 2 < 200.0).all()
+
     def test_every_limit_is_kept_and_the_one_that_prevents_is_named(self):
         limits = {"displacement": (1e-4 * X_C, 1e-3 * X_C), "frequency_hz": (1, 5)}
         plan = planned(time=600, limits=limits)

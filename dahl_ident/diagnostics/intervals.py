@@ -52,7 +52,7 @@ from dahl_ident.units import counted
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which limits are value * factor and value / factor
-_LARGEST_FACTOR = 1e8  # above it there is no limit
+LARGEST_FACTOR = 1e8  # above it there is no limit
 LARGE = 0.1  # u of a logarithm from noise alone, above which a side may be open
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _DISAGREES = 0.2  # half widths between the limits of two methods
@@ -255,7 +255,7 @@ def around(
         relative = np.where(space.positive, u / values, 0.0)
         by_factor = space.positive & ~(relative <= _BY_FACTOR)
         factor = np.exp(k * relative)
-        factor = np.where(factor <= _LARGEST_FACTOR, factor, np.inf)
+        factor = np.where(factor <= LARGEST_FACTOR, factor, np.inf)
         lower = np.where(by_factor, values / factor, values - k * u)
         upper = np.where(by_factor, values * factor, values + k * u)
     return np.maximum(lower, least), np.minimum(upper, most)

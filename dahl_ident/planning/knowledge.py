@@ -5,6 +5,7 @@ All numbers are in search coordinates: the logarithm of positive parameters, the
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,6 +18,7 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import NOISE, RUNS, excess
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.estimate import assumed_exponents
+from dahl_ident.diagnostics.intervals import LARGEST_FACTOR
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.elements.element import as_model
@@ -169,20 +171,24 @@ def _of_table(
     if values is None:
         theta, optimum = np.array(source.optimum.theta, dtype=np.float64), source.optimum
         finite = np.isfinite(theta) & np.isfinite(optimum.values)
-        for i in np.flatnonzero(~finite | ~np.isfinite(np.diagonal(optimum.covariance))):
-            name = problem.names[i]
-            if np.isinf(std[i]):
-                raise ValidationError(
-                    f"plan: the fit does not determine {name}; give "
-                    f"{argument('ranges', {name: (LOW, HIGH)})}, or plan from the model with "
-                    f"{argument('ranges')}"
-                )
+        u = np.sqrt(np.diagonal(optimum.covariance))
+        known = finite & (u <= np.where(problem.space.positive, np.log(LARGEST_FACTOR), np.inf))
+        for name in itertools.compress(problem.names, ~known & np.isinf(std)):
+            raise ValidationError(
+                f"plan: the fit does not determine {name}; give "
+                f"{argument('ranges', {name: (LOW, HIGH)})}, or plan from the model with "
+                f"{argument('ranges')}"
+            )
     if errors is not None:
         wider, names = errors.problem, (*problem.names, *assumed)
         kept = [i for i, name in enumerate(errors.names) if name in names]
         parameters, part = tuple(wider.parameters[i] for i in kept), np.ix_(kept, kept)
-        theta = _drawn(rng, errors.theta[kept], errors.covariance[part], draws, parameters)
         information = np.linalg.inv(errors.covariance)[part]
+        ranges_of = _among(parameters, problem.names, 1.0 / std**2, 0.0)
+        covariance = np.linalg.inv(np.linalg.inv(errors.covariance[part]) + np.diag(ranges_of))
+        change = _among(parameters, problem.names, centre, 0.0) - errors.theta[kept]
+        at = errors.theta[kept] + covariance @ (ranges_of * change)
+        theta = _drawn(rng, at, covariance, draws, parameters)
         stated, cycles = _row_noise(wider, 0.0)
         noise = float(np.hypot(stated, errors.rms(NOISE)))
         pairs = list(zip(errors.sources, errors.variances.tolist(), strict=True))
