@@ -11,6 +11,7 @@ from benchmarks.selection import choices
 from dahl_ident import compare_models, fit
 from dahl_ident.diagnostics.held_out import predictive_density
 from dahl_ident.errors import FitError
+from dahl_ident.fitting.optimum import Status
 from tests.friction_tables import FRICTION, relative_noise, stated, table
 from tests.histories import integrated_force
 
@@ -242,6 +243,15 @@ def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere():
     wild = replace(optimum, theta=optimum.problem.to_search([30.0, -1e6, 300.0]))
     with pytest.raises(FitError, match="no finite response"):
         predictive_density(wild)
+
+
+def test_a_search_that_stopped_is_marked_in_the_comparison():
+    data = table(beta=(1e-2, 1e1), n=8, noise=0.01)
+    found = compare_models(fit(data, di.Dahl()), {"spring": di.Dahl() + di.Spring()})
+    first, spring = found.models
+    stopped = replace(spring, optimum=replace(spring.optimum, status=Status.NOT_CONVERGED))
+    assert "did not converge" not in str(found)
+    assert "the search did not converge" in str(replace(found, models=(first, stopped)))
 
 
 def test_harmonics_of_tiny_covariance_do_not_spoil_the_fundamental():

@@ -297,10 +297,11 @@ class ModelComparison:
             gain, error = m.density.gain_over(first.density)
             changes = [_change(m.meaning[key], first.meaning[key]) for key in OF_FRICTION]
             mark = " (best)" if m is self.best else ""
+            stopped = "" if m.optimum.converged else "; the search did not converge"
             lines.append(
                 [
                     m.name,
-                    m.reason,
+                    m.reason + stopped,
                     percent(m.density.misfit),
                     percent(m.density.harmonic_misfit),
                     str(m.optimum.dof),

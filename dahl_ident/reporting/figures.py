@@ -16,6 +16,7 @@ from dahl_ident.diagnostics.bands import ENERGY
 from dahl_ident.diagnostics.confidence_levels import LEVELS, level_text, thresholds
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import shares
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Friction, UniversalCurve
 from dahl_ident.errors import ValidationError
@@ -60,7 +61,7 @@ def _of_table(fit: FitResult) -> Iterator[Picture]:
     finite = all(np.isfinite(estimate.value) for estimate in fit.params.values())
     if len(friction) == 1 and friction[0].rate_independent and finite:
         yield _loops(fit, friction[0])
-    if fit.success:
+    if fit.success and fit.status is not VerdictStatus.NOT_DESCRIBED:
         yield _profiles(fit)
     if fit.nvarys > 1 and np.isfinite(fit.covar).all():
         yield _correlation(fit)
