@@ -468,6 +468,7 @@ def test_an_exponent_stated_wrongly_is_not_described(alpha):
     fit = di.fit(held(di.Dahl(0.1, 30.0, alpha=alpha), 1), di.Dahl(alpha=1.0))
     assert fit.status == "not described"
     assert "The records contradict alpha = 1, which was stated" in fit.verdict
+    assert "consistent with noise" not in str(fit.goodness)
     right = di.fit(held(di.Dahl(0.1, 30.0, alpha=alpha), 1), di.Dahl(alpha=alpha))
     assert right.trusted, right.verdict
 

@@ -94,6 +94,11 @@ class RecordGoodness(Goodness):
     correlation: float = 0.0  # of residuals of neighbouring samples
 
     @property
+    def headline(self) -> str:
+        """The size of the residuals; what they consist of is judged with their errors."""
+        return f"The residuals are {percent(self.rms_misfit)} rms of the measured output."
+
+    @property
     def details(self) -> list[str]:
         """The numbers as text."""
         return [
