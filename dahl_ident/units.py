@@ -250,7 +250,10 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
     )
     if not match:
         raise UnitError(f"{what} is {text!r}; expected a number and its unit, such as '0.2 N'")
-    unit = parse_unit(match[2])
+    try:
+        unit = parse_unit(match[2])
+    except UnitError as exc:
+        raise UnitError(f"{what} is {text!r}: {exc}") from exc
     kind, motion, factor = kind_of(unit, kinds, what)
     return float(match[1]) * factor * unit.to_peak, kind, motion
 

@@ -43,6 +43,7 @@ def test_command_line_and_python_give_the_same_numbers(run):
     ("arguments", "message"),
     [
         (("fit", "-", "--mass", "heavy"), "mass is 'heavy'; expected a number in SI units"),
+        (("fit", "-", "--mass", "3blorp"), "mass is '3blorp': [blorp] is not a known unit"),
         (("simulate", "--f-max", "1", "-o", "x.csv"), "no value for sigma"),
         (
             ("simulate", "--f-max", "1", "--sigma", "2", "--levels", "a:b:c"),
