@@ -223,16 +223,9 @@ class Running:
     panel: ClassVar[str | None] = None
     jobs: int | None = setting("Processes; by default as many as processors.")
     scheduler: str | None = setting("Address of a Dask scheduler, tls://host:port.")
-    timeout: float | None = setting(
-        "Longest time for a device; by default 10 medians, at least 60 s.", unit="s"
-    )
+    timeout: float = setting("Longest time for a device.", 600.0, unit="s")
     memory: float | None = setting("Most memory for a device, GB; by default a fair share.")
-    patience: float = setting("Longest time without an answer from the scheduler.", 120.0, unit="s")
-    send_files: bool = setting(
-        "Send workers the contents of files, not paths.", False, "--send-files"
-    )
     dry_run: bool = setting("List what would be done.", False, "--dry-run")
-    redo: bool = setting("Repeat all fits if options have changed.", False, "--redo")
 
 
 @dataclass(frozen=True)
