@@ -267,10 +267,8 @@ class TestPlan:
             ({"candidates": 20.0}, "expected a number, pairs"),
             ({"candidates": 20}, "leave it out for settled sines"),
             ({"runs": 2}, "runs is planned with settled sines only"),
-            ({"larger": di.Dahl()}, "larger is planned with settled sines only"),
             ({"target": "response"}, "'response' is planned with settled sines only"),
             ({"controlled": "force"}, "controlled='force' is planned with settled sines only"),
-            ({"suspects": {"alpha": 0.1}}, "suspects is planned with settled sines only"),
             ({"limits": {"speed": 0.1, "time": 9}}, r"limits\['acceleration'\] is missing"),
             (
                 {"candidates": "multisine", "limits": {"time": 9}},

@@ -103,9 +103,6 @@ class Aim:
     ranges: list[str] | None = setting(
         "Range of a parameter with 95 % probability, f_max=0.05:0.2N; repeatable."
     )
-    suspects: list[str] | None = setting(
-        "Parameter that the model may need, and its target uncertainty, alpha=0.1; repeatable."
-    )
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``plan``."""
@@ -117,11 +114,9 @@ class Aim:
                 "none"
             )
         ranges = dict(_pair("ranges", text) for text in self.ranges or [])
-        suspects = dict(_pair("suspects", text) for text in self.suspects or [])
         return {
             "target": uncertainties or [name for name, _, _ in targets] or None,
             "ranges": {name: ends(f"ranges of {name}", text) for name, text in ranges.items()},
-            "suspects": {name: number(name, t, "1") for name, t in suspects.items()} or None,
         }
 
 

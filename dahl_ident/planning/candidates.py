@@ -143,8 +143,9 @@ def evaluate(
         "frequency_hz": frequency_hz[None],
     }
     possible = allowed(limits, sizes, len(frequency_hz))
+    # within a gap there is no response
+    possible &= (np.isfinite(predicted) & (predicted != 0.0)).all(axis=0)
     if by_force:
-        possible &= np.isfinite(predicted).all(axis=0)
         possible &= _single_valued(knowledge, level, frequency_hz)
     kept = np.flatnonzero(possible)
     relative = changes[:, kept] / predicted[:, kept, None]

@@ -63,8 +63,8 @@ def packed_information(
 
 
 @dataclass(frozen=True)
-class Term:
-    """One criterion on one model: D-optimality, or the uncertainty of targets."""
+class Criterion:
+    """D-optimality, or the uncertainty of targets, as a function of the cycles of a run."""
 
     # (..., K, S Q Q) information of one cycle at every candidate and draw; Q = P, or P + 2 with a
     # run's gain and phase after the parameters
@@ -72,11 +72,11 @@ class Term:
     known: FloatArray  # (S, P, P) information before the plan
     # s, standard deviation of a run's ln gain and phase; 0 if runs do not differ
     scatter: float = 0.0
+    runs: int = 1
     # (S, P, C) directions over their target standard uncertainties; None for D-optimality
     targets: FloatArray | None = None
     # (T,) first of the columns of each target, whose variances are added; None for one column each
     starts: IntArray | None = None
-    weight: float = 1.0  # in the sum of the terms
     between: FloatArray | None = None  # (P, P) covariance of the parameters between runs
     # number of the last parameters, departures, whose uncertainty is not part of the criterion
     departures: int = 0
@@ -98,14 +98,22 @@ class Term:
         left = np.linalg.inv(np.eye(P) + M @ self.between)
         return left @ M, left @ identity
 
-    def at(self, cycles: FloatArray, runs: int) -> tuple[FloatArray, FloatArray]:
-        """Return the weighted criterion, and its derivative with respect to the packed sums."""
-        S, L = self.of_run(cycles)
-        value, slope = self._criterion(self.known + runs * S)
-        slope = (self.weight * runs / len(self.known)) * (L.swapaxes(-1, -2) @ slope @ L)
-        return self.weight * value, slope.reshape(*value.shape, -1)
+    def only(self, candidates: Sequence[int] | IntArray) -> Criterion:
+        """Return the criterion of some candidates, or of each of several sets, (designs, m)."""
+        return replace(self, packed=self.packed[np.asarray(candidates, dtype=np.intp)])
 
-    def _criterion(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def at(self, cycles: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the criterion at the cycles of all candidates, and its sensitivities."""
+        S, L = self.of_run(cycles)
+        value, slope = self._of_information(self.known + self.runs * S)
+        slope = (self.runs / len(self.known)) * (L.swapaxes(-1, -2) @ slope @ L)
+        return value, slope.reshape(*value.shape, -1)
+
+    def gradient(self, sensitivities: FloatArray) -> FloatArray:
+        """Return derivatives with respect to the cycles of this criterion's candidates."""
+        return np.asarray((self.packed @ sensitivities[..., None])[..., 0])
+
+    def _of_information(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean over draws, (...), and S times its derivative, (..., S, P, P)."""
         inverse = np.linalg.inv(M)
         if self.targets is None:
@@ -128,29 +136,6 @@ class Term:
         return value, (inverse_c * share[..., None, :]) @ inverse_c.swapaxes(-1, -2)
 
 
-@dataclass(frozen=True)
-class Objective:
-    """The sum of terms over the same candidates, as a function of the cycles in one of `runs`."""
-
-    terms: tuple[Term, ...]
-    runs: int = 1
-
-    def only(self, candidates: Sequence[int] | IntArray) -> Objective:
-        """Return the objective of some candidates, or of each of several sets, (designs, m)."""
-        chosen = np.asarray(candidates, dtype=np.intp)
-        return replace(self, terms=tuple(replace(t, packed=t.packed[chosen]) for t in self.terms))
-
-    def at(self, cycles: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-        """Return the criterion and its sensitivities at the cycles of all candidates, (..., K)."""
-        terms = [term.at(cycles, self.runs) for term in self.terms]
-        return np.asarray(sum(value for value, _ in terms)), [slope for _, slope in terms]
-
-    def gradient(self, sensitivities: Sequence[FloatArray]) -> FloatArray:
-        """Return derivatives with respect to the cycles of this objective's candidates."""
-        pairs = zip(self.terms, sensitivities, strict=True)
-        return np.asarray(sum((t.packed @ s[..., None])[..., 0] for t, s in pairs))
-
-
 class ContinuousDesign(NamedTuple):
     """Seconds at each candidate, the criterion, and the largest d_k/d - 1: 0 at the optimum."""
 
@@ -160,7 +145,7 @@ class ContinuousDesign(NamedTuple):
 
 
 def continuous_design(
-    objective: Objective,
+    criterion: Criterion,
     frequency_hz: FloatArray,
     time: float,
     *,
@@ -169,15 +154,15 @@ def continuous_design(
 ) -> ContinuousDesign:
     """Return the best seconds at each candidate, without settling and change-over."""
     even = np.full(len(frequency_hz), time / len(frequency_hz))
-    seconds = _best_seconds(objective, frequency_hz, time, even, iterations, tolerance)
-    value, sensitivities = objective.at(seconds * frequency_hz)
-    rate = objective.gradient(sensitivities) * frequency_hz
+    seconds = _best_seconds(criterion, frequency_hz, time, even, iterations, tolerance)
+    value, sensitivities = criterion.at(seconds * frequency_hz)
+    rate = criterion.gradient(sensitivities) * frequency_hz
     excess = rate.max() / (rate @ seconds / time) - 1.0
     return ContinuousDesign(seconds, float(value), float(excess))
 
 
 def _best_seconds(
-    objective: Objective,
+    criterion: Criterion,
     frequency_hz: FloatArray,
     time: FloatArray | float,
     start: FloatArray,
@@ -191,8 +176,8 @@ def _best_seconds(
     """
     seconds = start * (time / start.sum(axis=-1, keepdims=True))
     power = np.ones((*seconds.shape[:-1], 1))
-    value, sensitivities = objective.at((least + seconds) * frequency_hz)
-    rate = objective.gradient(sensitivities) * frequency_hz
+    value, sensitivities = criterion.at((least + seconds) * frequency_hz)
+    rate = criterion.gradient(sensitivities) * frequency_hz
     for _ in range(iterations):
         mean = (rate * seconds).sum(axis=-1, keepdims=True) / time
         continues = (mean > 0.0) & (rate.max(axis=-1, keepdims=True) >= (1.0 + tolerance) * mean)
@@ -202,13 +187,13 @@ def _best_seconds(
             moved = seconds * (rate / mean) ** power
             moved *= time / moved.sum(axis=-1, keepdims=True)
         moved = np.where(continues, moved, seconds)
-        new_value, sensitivities = objective.at((least + moved) * frequency_hz)
+        new_value, sensitivities = criterion.at((least + moved) * frequency_hz)
         # only D-optimality is sure to rise at full steps; a step that falls is halved and repeated
         fell = (new_value < value)[..., None] & (power >= 0.1)
         power = np.where(fell, 0.5 * power, power)
         if fell.all():
             continue
-        new_rate = objective.gradient(sensitivities) * frequency_hz
+        new_rate = criterion.gradient(sensitivities) * frequency_hz
         seconds, rate = np.where(fell, seconds, moved), np.where(fell, rate, new_rate)
         value = np.where(fell[..., 0], value, new_value)
     return np.asarray(seconds)
@@ -243,12 +228,12 @@ class Exchange:
 
     def __init__(
         self,
-        objective: Objective,
+        criterion: Criterion,
         bench: BenchTime,
         pool: IntArray,
         coverage: Coverage | None = None,
     ) -> None:
-        self._objective, self._bench, self._pool = objective, bench, pool
+        self._criterion, self._bench, self._pool = criterion, bench, pool
         self._coverage = coverage or Coverage(1, 0.0, np.zeros(len(bench.frequency_hz)))
 
     def best(self, time: float, start: Sequence[int] = ()) -> Design | None:
@@ -282,12 +267,12 @@ class Exchange:
 
     def _best_cycles(
         self, levels: IntArray, time: float, iterations: int
-    ) -> tuple[Objective, FloatArray]:
-        """Return the objective and the best cycles of each design, (..., m); NaN if too short."""
+    ) -> tuple[Criterion, FloatArray]:
+        """Return the criterion and the best cycles of each design, (..., m); NaN if too short."""
         f = self._bench.frequency_hz[levels]
         least = LEAST_CYCLES / f
         spare = (time - self._bench.fixed(levels) - least.sum(axis=-1))[..., None]
-        sub = self._objective.only(levels)
+        sub = self._criterion.only(levels)
         shared = np.maximum(spare, _NO_TIME)
         seconds = _best_seconds(sub, f, shared, np.ones(f.shape), iterations, 0.003, least)
         cycles = (least + np.where(spare > 0.0, seconds, 0.0)) * f
@@ -319,7 +304,7 @@ class Exchange:
             return []
         joined, each = joined[fits], spare[fits] / joined.shape[1]
         cycles = LEAST_CYCLES + each[:, None] * self._bench.frequency_hz[joined]
-        values, _ = self._objective.only(joined).at(cycles)
+        values, _ = self._criterion.only(joined).at(cycles)
         return [int(k) for k in joined[np.argsort(-values)[:_TRIED], -1]]
 
     def whole(self, levels: Sequence[int], time: float) -> Design:
@@ -330,7 +315,7 @@ class Exchange:
         cycles = np.maximum(np.floor(best + 1e-9), float(LEAST_CYCLES))
         while True:
             value, sensitivities = sub.at(cycles)
-            seconds, runs = self._bench.seconds(ordered, cycles), self._objective.runs
+            seconds, runs = self._bench.seconds(ordered, cycles), self._criterion.runs
             possible = 1.0 / f <= time - seconds + 1e-9
             if not possible.any():
                 return Design(ordered, cycles, runs, float(value), runs * seconds)

@@ -2,8 +2,7 @@
 
 The model error of an earlier fit (:mod:`dahl_ident.diagnostics.bands`) enters as W more
 parameters, shared by earlier and later levels: a level close to a measured one then has little
-information, however long it is measured. Parameters that may be needed although the model fixes or
-omits them are forecast in a larger model.
+information, however long it is measured.
 """
 
 from __future__ import annotations
@@ -16,10 +15,9 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bands import Departures, departures
 from dahl_ident.diagnostics.confidence_levels import coverage_factor
-from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import OF_DRAWS, Candidates
-from dahl_ident.planning.design import Design, Term, packed_information
-from dahl_ident.planning.knowledge import Knowledge, spread, units_of
+from dahl_ident.planning.design import Criterion, Design, packed_information
+from dahl_ident.planning.knowledge import Knowledge, spread
 from dahl_ident.planning.question import RESPONSE, PlanRequest, is_expanded, least_factor, powers_of
 from dahl_ident.units import DEFINITIONS
 
@@ -29,7 +27,6 @@ _NONE = 1e12  # information with which departures are zero
 SEARCHED = 24  # draws that the search for levels averages over
 _SEARCHED_WITH_DEPARTURES = 2  # the same with departures: more parameters, close to the estimate
 _PLACES = 24  # candidates over which the uncertainty of the response is averaged
-_UNKNOWN = 1e-2  # information for the search: a suspected parameter is known within a decade or so
 
 
 @dataclass(frozen=True)
@@ -112,24 +109,28 @@ class Forecast:
             directions={name: d[some] for name, d in self.directions.items()},
         )
 
-    def term(self, target: Mapping[str, float], known: FloatArray | None = None) -> Term:
+    def criterion(
+        self, target: Mapping[str, float], known: FloatArray | None = None, runs: int = 1
+    ) -> Criterion:
         """Return the criterion: uncertainties over their targets, or D-optimality."""
         c = self.candidates
         packed = packed_information(c.rows, c.offsets, self.scatter)
         known = self.searched if known is None else known
-        term = Term(packed, known, self.scatter, between=self.between, departures=self.departures)
+        criterion = Criterion(
+            packed, known, self.scatter, runs, between=self.between, departures=self.departures
+        )
         if not target:
-            return term
+            return criterion
         columns = [self.directions[n] * least_factor(n) / u for n, u in target.items()]
         starts = np.cumsum([0, *(c.shape[-1] for c in columns[:-1])])
-        return replace(term, targets=np.concatenate(columns, axis=-1), starts=starts)
+        return replace(criterion, targets=np.concatenate(columns, axis=-1), starts=starts)
 
     def covariance(self, design: Design) -> FloatArray:
         """Return the covariance of parameters and departures after a design, (S, Q, Q)."""
         c = self.candidates.only(design.levels)
         packed = packed_information(c.rows, c.offsets, self.scatter)
-        term = Term(packed, self.before, self.scatter, between=self.between)
-        return covariance_of(self.before + design.runs * term.of_run(design.cycles)[0])
+        criterion = Criterion(packed, self.before, self.scatter, between=self.between)
+        return covariance_of(self.before + design.runs * criterion.of_run(design.cycles)[0])
 
     def uncertainty(self, covariance: FloatArray) -> dict[str, FloatArray]:
         """Return the relative standard uncertainty of every quantity at every draw."""
@@ -248,55 +249,3 @@ def typical(u: FloatArray) -> float:
 
 def _shown(u: float) -> float:
     return u if u < 100.0 else float("inf")
-
-
-def forecast_of_suspects(
-    question: PlanRequest, knowledge: Knowledge, candidates: Candidates
-) -> Forecast:
-    """Return the forecast of suspected parameters in the larger model, at the draws of `knowledge`.
-
-    If displacement is controlled, the second harmonic is included, because only it shows asymmetry;
-    the noise of a harmonic's force is that of the fundamental's.
-    """
-    larger, suspects = question.larger, question.suspects
-    assert larger is not None
-    levels = candidates.level, candidates.frequency_hz, candidates.controlled
-    problem = knowledge.problem_at(*levels, model=larger)
-    drawn = dict(zip(knowledge.names, knowledge.values.T, strict=True))
-    S, names, columns = len(knowledge.theta), problem.names, []
-    for p in problem.parameters:
-        if p.name not in drawn and p.value is None:
-            raise ValidationError(
-                f"the larger model has the free parameter {p.name}, about which nothing is known; "
-                "give it a value there"
-            )
-        columns.append(drawn.get(p.name, np.full(S, p.value)))
-    theta = problem.to_search(np.stack(columns, axis=-1))
-    units = units_of(problem.parameters, theta)
-    fundamental = problem.predict(theta)[..., None]
-    even = candidates.controlled == "displacement" and any(
-        e.has_harmonic(2) for e in larger.elements
-    )
-    rows = []
-    for k in (1, 2) if even else (1,):
-        harmonic_problem = knowledge.problem_at(*levels, model=larger, harmonic=k, noise="absolute")
-        with np.errstate(divide="ignore", invalid="ignore"):
-            relative = harmonic_problem.prediction_jacobian(theta) / fundamental
-        relative[~np.isfinite(relative)] = 0.0  # within a gap there is no response
-        parts = np.stack([relative.real, relative.imag], axis=2)
-        rows.append(parts * units * candidates.weight)
-    known = np.zeros((S, *2 * units.shape))
-    if knowledge.problem is not None:
-        before = knowledge.problem.like(model=larger, sensors=knowledge.sensors)
-        scale = 1.0 if before.scale_known else float(knowledge.row_noise or 1.0)
-        known = before.information(theta, scale) * np.outer(units, units)
-    searched = known + _UNKNOWN * np.eye(units.size)
-    for prior, name in zip(knowledge.prior, knowledge.names, strict=True):
-        i = names.index(name)
-        searched[:, i, i] += prior * units[i] ** 2
-    scaled = np.broadcast_to(np.diag(units), (S, *2 * units.shape))
-    directions = {name: scaled[..., [names.index(name)]] for name in suspects}
-    candidates = replace(candidates, rows=np.concatenate(rows, axis=2))
-    return Forecast(
-        knowledge, candidates, known, searched, directions, question.scatter, "none", departures=0
-    )

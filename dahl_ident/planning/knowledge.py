@@ -99,10 +99,6 @@ class Knowledge:
         levels: FloatArray,
         frequency_hz: FloatArray,
         controlled: str,
-        *,
-        model: Model | None = None,
-        harmonic: int = 1,
-        noise: str = "relative",
     ) -> TableProblem:
         """Return the problem of levels whose responses are not measured yet."""
         level: dict[str, Any] = {"drive" if controlled == "force" else "amplitude": levels}
@@ -111,11 +107,10 @@ class Knowledge:
             np.ones(len(levels)),
             controlled=controlled,
             motion=self.motion,
-            harmonic=harmonic,
             **level,
         )
         return TableProblem(
-            data, model or self.model, noise=noise, sensors=self.sensors, steady=self.steady
+            data, self.model, noise="relative", sensors=self.sensors, steady=self.steady
         )
 
     def model_values(self) -> list[FloatArray]:

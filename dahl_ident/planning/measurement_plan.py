@@ -17,7 +17,7 @@ from dahl_ident.diagnostics.formatting import listed, table
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
 from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_range
-from dahl_ident.planning.design import Design, Objective, continuous_design
+from dahl_ident.planning.design import Design, continuous_design
 from dahl_ident.planning.forecast import NOTHING, Expected, Forecast
 from dahl_ident.planning.motion_information import evaluate_motions, motions_of
 from dahl_ident.planning.question import BenchLimits, PlanRequest, is_expanded
@@ -79,7 +79,7 @@ class Plan:
     target : mapping of str to float
         Relative uncertainties that were asked for; empty if time was given.
     reached : bool
-        Whether the plan is predicted to meet all targets, those of suspected parameters included.
+        Whether the plan is predicted to meet all targets.
     undetermined : tuple of str
         Quantities that the plan does not determine, and the limit that prevents it.
     assumptions : tuple of str
@@ -423,9 +423,6 @@ def undetermined(
         if expected[name].after > 1.001 * u:
             what = "" if is_expanded(name) else "a standard uncertainty of "
             missed[name] = f"{name} reaches {what}{_shown(expected[name].after)}, not {_shown(u)}"
-    if q.suspects and search.suspect_ratio(design) > 1.0:
-        names = ", ".join(q.suspects)
-        missed.setdefault(names, f"the uncertainty of {names} does not meet its target")
     sentences = [f"{text}; {_prevented_by(search, name)}" for name, text in missed.items()]
     if not search.can_be_judged(design):
         sentences.append(
@@ -452,8 +449,6 @@ def _widened(search: Search, name: str) -> tuple[str, float]:
 
 def _prevented_by(search: Search, name: str) -> str:
     """Return the limit that prevents a smaller uncertainty."""
-    if name not in search.forecast.directions:
-        return "give more time or wider limits"
     limit, gain = _widened(search, name)
     if not limit:
         return "no limit was stated that prevents it"
@@ -470,10 +465,10 @@ def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits) ->
     """Return the uncertainty of a quantity with the best continuous design."""
     candidates = candidates_within(question, limits)
     few = Forecast.of(question, candidates).thinned()
-    term = few.term({name: 1.0}, few.before + NOTHING * np.eye(few.before.shape[-1]))
+    criterion = few.criterion({name: 1.0}, few.before + NOTHING * np.eye(few.before.shape[-1]))
     time = limits.time if np.isfinite(limits.time) else 1000.0
     frequency_hz = candidates.frequency_hz
-    design = continuous_design(Objective((term,)), frequency_hz, time, tolerance=0.1)
+    design = continuous_design(criterion, frequency_hz, time, tolerance=0.1)
     return float(np.exp(-0.5 * design.value))
 
 

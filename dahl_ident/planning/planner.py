@@ -10,7 +10,6 @@ import numpy as np
 
 from dahl_ident.arrays import non_negative_array, positive_number, whole_number
 from dahl_ident.data.columns import CONTROLLED, one_of
-from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import STEADY, Steady
 from dahl_ident.errors import ValidationError, argument
 from dahl_ident.planning.candidates import evaluate
@@ -28,7 +27,6 @@ from dahl_ident.planning.question import (
     RESPONSE,
     BenchLimits,
     PlanRequest,
-    larger_model,
     limit,
     motions_among,
     noise_of_cycle,
@@ -50,8 +48,6 @@ def plan(
     runs: int | None = None,
     controlled: str = "displacement",
     candidates: int | str | Sequence[tuple[float, float]] | Sequence[PlannedMotion] = 240,
-    larger: Element | None = None,
-    suspects: Mapping[str, float] | None = None,
     change_over: float = 1.0,
     settled: float = 0.01,
     between_runs: float = 0.0,
@@ -97,12 +93,6 @@ def plan(
         The levels to choose from, or their number. ``"trapezoid"`` and ``"multisine"`` stand for
         motions in time within the limits, to be fitted as records; or give them as
         :class:`dahl_ident.planning.Trapezoid` and :class:`dahl_ident.planning.Multisine`.
-    larger : Element, optional
-        Model in which `suspects` are parameters; by default the model itself.
-    suspects : mapping of str to float, optional
-        Parameters that may be needed although the model fixes or omits them, such as ``{"alpha":
-        0.1}``, and the standard uncertainty of each in the larger model that the plan must meet:
-        relative for positive parameters, absolute for others.
     change_over : float, default 1
         Seconds from one level to the next.
     settled : float, default 0.01
@@ -180,8 +170,6 @@ def plan(
         for_sines_only = {
             "target 'response'": RESPONSE in targets,
             "scatter": bool(scatter),
-            "suspects": bool(suspects),
-            "larger": larger is not None,
             "runs": runs not in (None, 1),
             argument("controlled", "force"): controlled == "force",
         }
@@ -213,8 +201,6 @@ def plan(
         noise_of_cycle(noise, knowledge),
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
         None if runs is None else whole_number(runs, "runs", 1),
-        larger_model(knowledge, larger, suspects),
-        dict(suspects or {}),
     )
     if isinstance(candidates, int):
         options = candidates_within(question, bench, whole_number(candidates, "candidates", 2))

@@ -11,8 +11,6 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, positive_number
 from dahl_ident.diagnostics.confidence_levels import coverage_factor
-from dahl_ident.elements import Element, Model
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError, argument, choices, spelled
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.trajectories import KINDS, PlannedMotion
@@ -113,8 +111,6 @@ class PlanRequest:
     noise: CycleNoise = field(default_factory=lambda: CycleNoise(0.0))
     scatter: float = 0.0
     runs: int | None = 1
-    larger: Model | None = None
-    suspects: dict[str, float] = field(default_factory=dict)
     recorded: RecordedForce | None = None
     motions: str | tuple[PlannedMotion, ...] = ()
 
@@ -198,27 +194,6 @@ def target_of(target: Any) -> tuple[dict[str, float], bool]:
                 f"target[{name!r}] is {u:g}; expected a relative uncertainty below 1: 0.02 is 2 %"
             )
     return checked, bool(checked)
-
-
-def larger_model(
-    knowledge: Knowledge, larger: Element | None, suspects: Mapping[str, float] | None
-) -> Model | None:
-    """Return the model in which suspected parameters are free; None if there are none."""
-    if not suspects:
-        if larger is not None:
-            raise ValidationError("larger is given without suspects; name its parameters there")
-        return None
-    for name, u in suspects.items():
-        positive_number(u, f"suspects[{name!r}]")
-    model = as_model(larger) if larger is not None else knowledge.model
-    names = {p.name for p in model.parameters}
-    unknown = sorted(set(suspects) - names)
-    if unknown:
-        raise ValidationError(
-            f"suspects names {', '.join(unknown)}, which {model!r} does not have; give a model "
-            "that has them, in Python as larger="
-        )
-    return model.with_free([*suspects, *(names & set(knowledge.names))])
 
 
 # Quantities: parameters, products of their powers, U(...) of either, the predicted response

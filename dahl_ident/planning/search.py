@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -12,15 +12,14 @@ from dahl_ident.arrays import IntArray
 from dahl_ident.diagnostics.trends import LEAST_DOF, LEAST_RANGE
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime, Candidates
-from dahl_ident.planning.design import Coverage, Design, Exchange, Objective, continuous_design
-from dahl_ident.planning.forecast import Expected, Forecast, forecast_of_suspects, typical
+from dahl_ident.planning.design import Coverage, Design, Exchange, continuous_design
+from dahl_ident.planning.forecast import Expected, Forecast, typical
 from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
 from dahl_ident.planning.question import PlanRequest, limit
 
 _POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # to average scatter between runs: a ninth run would gain 6 %
-_WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of suspected parameters; the least that suffices
 LONGEST = 30.0 * 86400.0  # s: a month, the longest plan if no time is given
 _LONGER = 4.0  # factor from one time to the next until a target is reached
 _HELPS = 0.1  # more time is useless below this fraction of the gain by the square root of time
@@ -45,11 +44,7 @@ class Search:
             candidates = candidates.only(np.flatnonzero(settles))
             self.bench = BenchTime.of(candidates, knowledge, **question.costs)
         self.forecast = Forecast.of(question, candidates)
-        few = self.forecast.thinned()
-        self._terms, self._suspects = [few.term(question.target)], None
-        if question.larger is not None:
-            self._suspects = forecast_of_suspects(question, few.knowledge, few.candidates)
-            self._terms.append(self._suspects.term(question.suspects))
+        self._criterion = self.forecast.thinned().criterion(question.target)
         self._pool: IntArray | None = None
 
     def best(self) -> Design:
@@ -67,32 +62,17 @@ class Search:
 
     def solve(self, time: float, start: Sequence[int] = ()) -> Design | None:
         """Return the best levels and runs for a time; None where it is too short."""
-        ratios: list[tuple[float, Design]] = []
-        for weight in (0.0,) if self._suspects is None else _WEIGHTS:
-            design = self._solve(time, weight, start)
-            if design is None:
-                return None
-            ratios.append((self.suspect_ratio(design), design))
-            if ratios[-1][0] <= 1.0:
-                break
-        return min(ratios, key=lambda pair: pair[0])[1]
-
-    def _solve(self, time: float, weight: float, start: Sequence[int]) -> Design | None:
         q, best = self.question, None
         most = _MOST_RUNS if q.scatter > 0.0 or self.forecast.between is not None else 1
         for runs in (q.runs,) if q.runs else range(1, most + 1):
-            objective = self._objective(weight, runs)
-            search = Exchange(objective, self.bench, self._promising(time), self._coverage)
+            criterion = replace(self._criterion, runs=runs)
+            search = Exchange(criterion, self.bench, self._promising(time), self._coverage)
             design = search.best(time / runs, start)
             if design is None or (best is not None and design.value <= best.value):
                 break
             best = replace(design, ratio=self.ratio(design))
             start = design.levels.tolist()
         return best
-
-    def _objective(self, weight: float, runs: int = 1) -> Objective:
-        weighted = zip(self._terms, (1.0 - weight, weight), strict=False)
-        return Objective(tuple(replace(term, weight=w) for term, w in weighted if w > 0.0), runs)
 
     @cached_property
     def _coverage(self) -> Coverage:
@@ -126,9 +106,8 @@ class Search:
             usual = 0.2 * time if np.isfinite(time) else 20.0 * float(np.median(alone))
             reachable = alone + LEAST_CYCLES / f <= time
             rate = f * usual / (usual + alone) * reachable + 1e-12
-            objective = self._objective(0.5 if self._suspects else 0.0)
             seconds, _, _ = continuous_design(
-                objective, rate, usual, tolerance=0.05, iterations=200
+                self._criterion, rate, usual, tolerance=0.05, iterations=200
             )
             best = np.argsort(-seconds, kind="stable")[: _POOL // 2]
             even = np.argsort(self.bench.force, kind="stable")[spread(K, _POOL // 2)]
@@ -136,15 +115,10 @@ class Search:
         return self._pool
 
     def ratio(self, design: Design) -> float:
-        """Return the largest ratio of an uncertainty to its target, suspects included."""
-        numbers = self.question.target if self.question.has_numbers else {}
-        return max(_ratio(self.forecast, numbers, design), self.suspect_ratio(design))
-
-    def suspect_ratio(self, design: Design) -> float:
-        """Return the largest ratio of a suspected parameter's uncertainty to its target."""
-        if self._suspects is None:
-            return 0.0
-        return _ratio(self._suspects, self.question.suspects, design)
+        """Return the largest ratio of an uncertainty to its target, 0 without any."""
+        target = self.question.target if self.question.has_numbers else {}
+        after = self.forecast.after(design)[0] if target else {}
+        return max((typical(after[name]) / u for name, u in target.items()), default=0.0)
 
     def least_time(self) -> Design | None:
         """Return the shortest plan that reaches the targets, or the best in the time allowed.
@@ -224,9 +198,3 @@ class Search:
         each = np.full(len(ordered), cycles)
         seconds = runs * self.bench.seconds(ordered, each)
         return Design(ordered, each, runs, np.nan, seconds)
-
-
-def _ratio(forecast: Forecast, target: Mapping[str, float], design: Design) -> float:
-    """Return the largest ratio of an uncertainty to its target, 0 without any."""
-    after = forecast.after(design)[0] if target else {}
-    return max((typical(after[name]) / u for name, u in target.items()), default=0.0)
