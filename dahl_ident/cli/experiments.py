@@ -66,9 +66,8 @@ class Bench:
     controlled: str = controlled_setting()
     steady: str | None = steady_setting(None)
     motion: str | None = setting(
-        "Plan motions in time, for a fit of records: trapezoid or multisine; without it, settled "
-        "sines.",
-        one_of="trapezoid|multisine",
+        "Plan motions in time, for a fit of records; without it, settled sines.",
+        one_of="trapezoid",
     )
     noise: str | None = setting(
         "Noise of one cycle: '1 %', or 'relative=0.01,force=1mN,displacement=0.1um'; of a "

@@ -290,7 +290,8 @@ def _of_records(
     others = np.array([p.std * p.others[:P] / slope for p in exponents]).reshape(-1, P)
     root = np.vstack([others.T, np.diag([p.std for p in exponents])])
     joint = root @ root.T
-    joint[:P, :P] += excess(covariance, joint[:P, :P])
+    noise = fit.errors.contributions[NOISE][:P, :P] / np.outer(slope, slope)
+    joint[:P, :P] += noise + excess(covariance, joint[:P, :P] + noise)
     names = [*(p.name for p in free), *assumed]
     order = [names.index(p.name) for p in parameters]
     joint = joint[np.ix_(order, order)]

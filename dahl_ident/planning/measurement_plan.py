@@ -19,10 +19,10 @@ from dahl_ident.planning import trajectories
 from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_range
 from dahl_ident.planning.design import Design, continuous_design
 from dahl_ident.planning.forecast import NOTHING, Expected, Forecast
-from dahl_ident.planning.motion_information import evaluate_motions, motions_of
+from dahl_ident.planning.motion_information import evaluate_motions, trapezoids_within
 from dahl_ident.planning.question import BenchLimits, PlanRequest, is_expanded
 from dahl_ident.planning.search import LONGEST, Search
-from dahl_ident.planning.trajectories import PlannedMotion
+from dahl_ident.planning.trajectories import Trapezoid
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
 from dahl_ident.units import Motion, percent, shown_unit, si_unit
 
@@ -55,7 +55,7 @@ class PlanStep:
     settling_cycles: int  # before measuring
     measured_cycles: int  # of a motion in time, the number of repeats
     seconds: float  # change-over, settling and measuring
-    motion: PlannedMotion | None = None  # the motion in time; None for a sine
+    motion: Trapezoid | None = None  # the motion in time; None for a sine
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Plan:
         write_whole(place, frame.to_csv(index=False).encode(), overwrite=overwrite)
         return place
 
-    def _check_moves(self, motions: list[trajectories.PlannedMotion]) -> None:
+    def _check_moves(self, motions: list[Trapezoid]) -> None:
         """Check that the moves to the motions' starts are within the limits of the exciter."""
         limits, position = self.search.question.limits, 0.0
         for i, motion in enumerate(motions, start=1):
@@ -360,15 +360,14 @@ class Plan:
     def _table(self) -> str:
         """Return the steps as text, one line each."""
         rows = [_row(step) for step in self.steps]
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        names.sort(key=lambda name: name in ("period", "repeats", "seconds"))  # these come last
+        names = list(rows[0])
         units = {**trajectories.UNITS, "level": "N" if self.controlled == "force" else "m"}
         headings = [name.removesuffix("_hz").replace("_", " ") for name in names]
         for i, name in enumerate(names):
             if name in units:
                 headings[i] += f" [{shown_unit(units[name], self.motion)}]"
         lines = [
-            [str(i), *(_as_text(row.get(name, "-")) for name in names)]
+            [str(i), *(_as_text(row[name]) for name in names)]
             for i, row in enumerate(rows, start=1)
         ]
         return table([["", *headings], *lines])
@@ -380,14 +379,14 @@ def _as_text(value: float | str) -> str:
 
 
 def _row(step: PlanStep) -> dict[str, Any]:
-    """Return the fields of a step; for a motion, its kind and parameters."""
+    """Return the fields of a step; for a motion, its parameters."""
     fields = dict(vars(step))
     motion = fields.pop("motion")
     if motion is None:
         return fields
     return {
-        "motion": motion.kind,
-        **motion.parameters,
+        "motion": "trapezoid",
+        **vars(motion),
         "period": motion.period,
         "repeats": step.measured_cycles,
         "seconds": step.seconds,
@@ -403,9 +402,9 @@ def candidates_within(
     """Return the candidates within limits; motions are repeated for `lasting` s."""
     if question.recorded is None:
         return evaluate(question, limits, *grid(question, limits, count))
-    motions: Sequence[PlannedMotion] | str = question.motions
+    motions: Sequence[Trapezoid] | str = question.motions
     if isinstance(motions, str):
-        motions = motions_of(motions, limits, level_range(question, limits))
+        motions = trapezoids_within(limits, level_range(question, limits))
     return evaluate_motions(question.knowledge, motions, limits, question.recorded, lasting)
 
 

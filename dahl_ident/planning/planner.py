@@ -34,7 +34,7 @@ from dahl_ident.planning.question import (
     target_of,
 )
 from dahl_ident.planning.search import Search
-from dahl_ident.planning.trajectories import PlannedMotion
+from dahl_ident.planning.trajectories import Trapezoid
 
 
 def plan(
@@ -47,7 +47,7 @@ def plan(
     scatter: float | None = None,
     runs: int | None = None,
     controlled: str = "displacement",
-    candidates: int | str | Sequence[tuple[float, float]] | Sequence[PlannedMotion] = 240,
+    candidates: int | str | Sequence[tuple[float, float]] | Sequence[Trapezoid] = 240,
     change_over: float = 1.0,
     settled: float = 0.01,
     between_runs: float = 0.0,
@@ -90,9 +90,9 @@ def plan(
     controlled : {"displacement", "force"}
         The controlled quantity. With "force", levels are drives of the whole plant.
     candidates : int, sequence of (level, frequency_hz), str, or sequence of motions, default 240
-        The levels to choose from, or their number. ``"trapezoid"`` and ``"multisine"`` stand for
-        motions in time within the limits, to be fitted as records; or give them as
-        :class:`dahl_ident.planning.Trapezoid` and :class:`dahl_ident.planning.Multisine`.
+        The levels to choose from, or their number. ``"trapezoid"`` stands for trapezoidal motions
+        in time within the limits, to be fitted as records; or give a list of
+        :class:`dahl_ident.planning.Trapezoid`.
     change_over : float, default 1
         Seconds from one level to the next.
     settled : float, default 0.01

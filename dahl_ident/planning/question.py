@@ -13,7 +13,7 @@ from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, po
 from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.errors import ValidationError, argument, choices, spelled
 from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.trajectories import KINDS, PlannedMotion
+from dahl_ident.planning.trajectories import Trapezoid
 
 RESPONSE = "response"
 _POWER = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\^(?P<power>-?\d+(?:\.\d+)?))?")
@@ -112,7 +112,7 @@ class PlanRequest:
     scatter: float = 0.0
     runs: int | None = 1
     recorded: RecordedForce | None = None
-    motions: str | tuple[PlannedMotion, ...] = ()
+    motions: str | tuple[Trapezoid, ...] = ()
 
 
 def noise_of_cycle(noise: float | Mapping[str, float] | None, knowledge: Knowledge) -> CycleNoise:
@@ -164,19 +164,19 @@ def recorded_force(
     return RecordedForce(positive_number(noise["force"], "noise['force']"), rate)
 
 
-def motions_among(candidates: Any) -> str | tuple[PlannedMotion, ...]:
+def motions_among(candidates: Any) -> str | tuple[Trapezoid, ...]:
     """Return the motions in time that `candidates` has; empty for sines."""
     if isinstance(candidates, int):
         return ()
-    if isinstance(candidates, str) and candidates in KINDS:
-        return candidates
+    if candidates == "trapezoid":
+        return "trapezoid"
     if isinstance(candidates, str) or not np.iterable(candidates):
         raise ValidationError(
             f"candidates is {candidates!r}; expected a number, pairs of level and frequency, a "
-            f"list of motions, or one of {', '.join(KINDS)}"
+            "list of motions, or 'trapezoid'"
         )
     listed = tuple(candidates)
-    are_motions = [isinstance(candidate, PlannedMotion) for candidate in listed]
+    are_motions = [isinstance(candidate, Trapezoid) for candidate in listed]
     if any(are_motions) and not all(are_motions):
         raise ValidationError("candidates holds motions and others; plan either of them")
     return listed if any(are_motions) else ()
