@@ -371,7 +371,6 @@ SERIES = {
     "validation": [f"ensaio.vali.{i}.mat" for i in range(1, 10)],
 }
 CHOSEN = 4  # levels of a series
-AIMS = {"all parameters": None, "response": "response"}
 
 
 @dataclass(frozen=True)
@@ -391,7 +390,6 @@ class Choices:
     """
 
     series: str
-    aim: str
     levels: int
     evenly: float
     typical: float
@@ -413,18 +411,17 @@ def damper(folder: Path) -> Iterator[Choices]:
         fours = list(itertools.combinations(numbers, CHOSEN))
         every = {four: _predicted(levels, four, model) for four in fours}
         even = tuple(np.linspace(0, len(levels) - 1, CHOSEN).round().astype(int).tolist())
-        for aim, target in AIMS.items():
-            found, better = [], []
-            for pair in itertools.combinations(numbers, 2):
-                found.append(every[_chosen(levels, pair, model, target)])
-                ways = [every[four][0] for four in fours if set(pair) <= set(four)]
-                better.append(np.mean(np.array(ways) >= found[-1][0]))
-            inside, count = (sum(one[i] for one in found) for i in (1, 2))
-            yield Choices(
-                series, aim, len(levels), every[even][0],
-                float(np.median([error for error, _, _ in every.values()])),
-                np.array([error for error, _, _ in found]), float(np.mean(better)), inside / count,
-            )  # fmt: skip
+        found, better = [], []
+        for pair in itertools.combinations(numbers, 2):
+            found.append(every[_chosen(levels, pair, model)])
+            ways = [every[four][0] for four in fours if set(pair) <= set(four)]
+            better.append(np.mean(np.array(ways) >= found[-1][0]))
+        inside, count = (sum(one[i] for one in found) for i in (1, 2))
+        yield Choices(
+            series, len(levels), every[even][0],
+            float(np.median([error for error, _, _ in every.values()])),
+            np.array([error for error, _, _ in found]), float(np.mean(better)), inside / count,
+        )  # fmt: skip
 
 
 def _level(path: Path) -> FrequencyResponse:
@@ -451,47 +448,35 @@ def damper_table(choices: Sequence[Choices]) -> str:
         "Required: smaller than of four evenly spaced levels (else marked (!)), and inside the "
         "95.45 % bands.",
         "",
-        "| series | plan for | plans | evenly spaced | all choices of four | plan better than "
+        "| series | plans | evenly spaced | all choices of four | plan better than "
         "evenly | than other additions to the pair | inside the bands |",
-        "|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|",
     ]
-    for aim in AIMS:
-        own = [c for c in choices if c.aim == aim]
-        for c in own:
-            median = float(np.median(c.planned))
-            won = float(np.mean(c.planned < c.evenly))
-            lines.append(
-                _damper_row(c.series, aim, median, c.evenly, c.typical, won, c.better, c.inside)
-            )
-        means = [
-            float(np.mean(one))
-            for one in zip(
-                *(
-                    (
-                        float(np.median(c.planned)), c.evenly, c.typical,
-                        float(np.mean(c.planned < c.evenly)), c.better, c.inside,
-                    )
-                    for c in own
-                ), strict=True,
-            )
-        ]  # fmt: skip
-        lines.append(_damper_row("mean", aim, *means))
+    rows = [
+        (
+            float(np.median(c.planned)), c.evenly, c.typical,
+            float(np.mean(c.planned < c.evenly)), c.better, c.inside,
+        )
+        for c in choices
+    ]  # fmt: skip
+    lines += [_damper_row(c.series, *row) for c, row in zip(choices, rows, strict=True)]
+    lines.append(_damper_row("mean", *(float(np.mean(one)) for one in zip(*rows, strict=True))))
     return "\n".join(lines)
 
 
 def _damper_row(
-    series: str, aim: str, plans: float, evenly: float, typical: float, won: float, better: float,
+    series: str, plans: float, evenly: float, typical: float, won: float, better: float,
     inside: float,
 ) -> str:  # fmt: skip
     missed = "" if plans < evenly else " (!)"
     return (
-        f"| {series} | {aim} | {plans:.2%}{missed} | {evenly:.2%} | {typical:.2%} | {won:.0%} "
+        f"| {series} | {plans:.2%}{missed} | {evenly:.2%} | {typical:.2%} | {won:.0%} "
         f"| {better:.0%} | {inside:.0%} |"
     )
 
 
 def _chosen(
-    levels: Sequence[FrequencyResponse], pair: tuple[int, int], model: Model, target: str | None
+    levels: Sequence[FrequencyResponse], pair: tuple[int, int], model: Model
 ) -> tuple[int, ...]:
     chosen = list(pair)
     while len(chosen) < CHOSEN:
@@ -500,7 +485,7 @@ def _chosen(
         options = [(_amplitude(levels[i]), float(levels[i].frequency_hz[0])) for i in rest]
         plan = di.plan(
             fit, limits={"frequency_hz": (0.1, 3.0), "time": 6.0}, candidates=options, draws=30,
-            target=target, ranges=KNOWN, settled=1.0,
+            ranges=KNOWN, settled=1.0,
         )  # fmt: skip
         (best,) = plan.steps  # no time for two
         chosen.append(rest[int(np.argmin([abs(A - best.level) for A, _ in options]))])

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -85,7 +84,6 @@ class TestContinuousDesign:
         "change",
         [
             {},
-            {"starts": np.array([0, 1])},
             {"targets": None},
             {"targets": None, "departures": 1},
             {"between": np.diag([0.3, 0.0, 0.1])},
@@ -132,7 +130,7 @@ class TestModelError:
 
     def test_levels_are_spread_by_the_model_error(self):
         fit = self._fit()
-        plan = di.plan(fit, limits={**KNEE, "time": 60}, target="response", candidates=25)
+        plan = di.plan(fit, limits={**KNEE, "time": 60}, candidates=25)
         alone = planned(time=60, noise=0.002, candidates=25)
         assert len(plan.steps) > len(alone.steps) + 1
         assert "the model errs as the earlier data show" in str(plan)
@@ -277,7 +275,6 @@ class TestPlan:
         plan = planned(noise=0.02, target={"f_max": 1e-9}, draws=10, candidates=20)
         assert not plan.reached
         assert plan.seconds == pytest.approx(30.0 * 86400.0, rel=1e-3)
-        assert "no plan takes more than 30 days" in str(plan)
 
     def test_drives_that_friction_cannot_hold_are_left_out(self):
         plan = di.plan(
@@ -366,7 +363,6 @@ class TestPlan:
         one = planned(time=300, target="sigma")
         many = planned(time=300, target="sigma", scatter=0.02)
         assert (one.runs, many.runs > 3) == (1, True)
-        assert many.expected["sigma"].scatter_share > 0.5
         assert many.seconds <= 300.0
 
     def test_friction_that_differs_from_day_to_day_is_measured_on_more_days(self):
@@ -386,24 +382,11 @@ class TestPlan:
         told = one.expected["f_max"]
         # the mean of four days instead of three
         assert told.after == pytest.approx(told.before * np.sqrt(3.0 / 4.0), rel=0.02)
-        assert told.scatter_share > 0.9
         assert "% of f_max" in str(one)
         plan = di.plan(fit, limits=KNEE, target={"f_max": 0.7 * told.before}, draws=20)
         assert (plan.reached, plan.runs) == (True, 4)  # seven days: sqrt(3/7) = 0.65
         alike = di.plan(fit, limits=KNEE, target={"f_max": 0.7 * told.before}, draws=20, scatter=0)
         assert alike.runs == 1
-
-    def test_the_limit_that_makes_a_plan_long_is_named(self):
-        """In microslip a tenth of the amplitude takes a hundred times as long."""
-        plan = di.plan(
-            LINEAR, ranges=NEAR, noise=0.01, target={"f_max": 0.02}, draws=20,
-            limits={"displacement": 6e-3 * X_C, "frequency_hz": 1.0},
-        )  # fmt: skip
-        assert plan.reached
-        hours = re.match(r"1 level in \S+ s \((\S+) h\); meets the target", str(plan))[1]
-        assert float(hours) == pytest.approx(plan.seconds / 3600.0, rel=0.05)
-        share = re.search(r"limit of displacement costs time.* in 1/(\d+) of the", str(plan))[1]
-        assert float(share) == pytest.approx(100.0, rel=0.2)
 
     def test_least_time_with_scatter_takes_as_few_runs_as_needed(self):
         # 2 % between runs leaves 1 % only with more than four
@@ -411,22 +394,6 @@ class TestPlan:
                        candidates=30)  # fmt: skip
         assert (plan.reached, plan.runs) == (True, 5)
         assert plan.seconds < 320.0
-
-    def test_an_expanded_uncertainty_is_wanted_by_name(self):
-        standard = planned(target={"f_max": 0.004}, noise=0.02, draws=20)
-        expanded = planned(target={"U(f_max)": 0.008}, noise=0.02, draws=20)
-        # k = 2.0000 at 95.45 % of a normal distribution
-        assert expanded.steps == standard.steps
-        told = expanded.expected
-        assert told["U(f_max)"].after == pytest.approx(2.0 * told["f_max"].after, rel=1e-4)
-        assert "U(...) expanded" in str(expanded)
-
-    def test_few_runs_widen_an_expanded_uncertainty(self):
-        plan = planned(time=600, noise=0.001, scatter=0.02, runs=4, target=["U(f_max)"], draws=20,
-                       candidates=40)  # fmt: skip
-        told = plan.expected
-        # Student's t of three degrees of freedom: 3.31 at 95.45 %; scatter is nearly all
-        assert told["U(f_max)"].after == pytest.approx(3.31 * told["f_max"].after, rel=0.02)
 
     def test_a_driven_plant_is_planned_by_its_drive(self):
         plant = LINEAR + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
@@ -574,11 +541,3 @@ def _exponent_error(plan):
     if np.linalg.matrix_rank(J, tol=1e-6 * np.abs(J).max()) < 3:
         return float("inf")
     return float(np.sqrt(np.linalg.inv(J.T @ J)[2, 2]))
-
-
-def test_a_target_that_the_data_meet_already_is_said_to_be_met():
-    fit = di.fit(di.load_dataset("noisy"), di.Dahl(alpha=1.0))
-    limits = {"displacement": 0.03, "frequency_hz": 5.0}
-    met, open_target = (str(di.plan(fit, limits=limits, target={"f_max": u})) for u in (0.02, 1e-3))
-    assert "meets the target, which the data at hand meet already" in met
-    assert "at hand" not in open_target

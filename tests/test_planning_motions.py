@@ -245,7 +245,6 @@ class TestPlan:
             ({"candidates": 20.0}, "expected a number, pairs"),
             ({"candidates": 20}, "leave it out for settled sines"),
             ({"runs": 2}, "runs is planned with settled sines only"),
-            ({"target": "response"}, "'response' is planned with settled sines only"),
             ({"controlled": "force"}, "controlled='force' is planned with settled sines only"),
             ({"limits": {"speed": 0.1, "time": 9}}, r"limits\['acceleration'\] is missing"),
             ({"limits": {**BENCH, "time": 9, "force": 1e-9}}, "force excludes"),

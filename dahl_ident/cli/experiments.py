@@ -96,8 +96,8 @@ class Aim:
     panel: ClassVar[str] = "Aim"
     target: list[str] | None = setting(
         "Relative standard uncertainty to be met in the least time, f_max=0.02 or "
-        "f_max/sigma=0.02, or an expanded one, 'U(f_max)=0.04'; a name alone is given the least "
-        "uncertainty within --time. Repeatable; by default all parameters."
+        "f_max/sigma=0.02; a name alone is given the least uncertainty within --time. Repeatable; "
+        "by default all parameters."
     )
     ranges: list[str] | None = setting(
         "Range of a parameter with 95 % probability, f_max=0.05:0.2N; repeatable."

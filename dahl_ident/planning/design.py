@@ -75,8 +75,6 @@ class Criterion:
     runs: int = 1
     # (S, P, C) directions over their target standard uncertainties; None for D-optimality
     targets: FloatArray | None = None
-    # (T,) first of the columns of each target, whose variances are added; None for one column each
-    starts: IntArray | None = None
     between: FloatArray | None = None  # (P, P) covariance of the parameters between runs
     # number of the last parameters, departures, whose uncertainty is not part of the criterion
     departures: int = 0
@@ -125,14 +123,11 @@ class Criterion:
             return -np.linalg.slogdet(part)[1].mean(axis=-1) / P, slope / P
         inverse_c = inverse @ self.targets
         variances = np.einsum("...spc,spc->...sc", inverse_c, self.targets)
-        count = variances.shape[-1]
-        starts = np.arange(count) if self.starts is None else self.starts
-        sums = np.add.reduceat(variances, starts, axis=-1)
-        top = sums.max(axis=-1, keepdims=True)
-        powers = (sums / top) ** (_NORM - 1.0)
-        total = (powers * sums / top).sum(axis=-1)
+        top = variances.max(axis=-1, keepdims=True)
+        powers = (variances / top) ** (_NORM - 1.0)
+        total = (powers * variances / top).sum(axis=-1)
         value = -(np.log(top[..., 0]) + np.log(total) / _NORM).mean(axis=-1)
-        share = np.repeat(powers / (total[..., None] * top), np.diff([*starts, count]), axis=-1)
+        share = powers / (total[..., None] * top)
         return value, (inverse_c * share[..., None, :]) @ inverse_c.swapaxes(-1, -2)
 
 

@@ -14,11 +14,10 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bands import Departures, departures
-from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.planning.candidates import OF_DRAWS, Candidates
 from dahl_ident.planning.design import Criterion, Design, packed_information
 from dahl_ident.planning.knowledge import Knowledge, spread
-from dahl_ident.planning.question import RESPONSE, PlanRequest, is_expanded, least_factor, powers_of
+from dahl_ident.planning.question import PlanRequest, powers_of
 from dahl_ident.units import DEFINITIONS
 
 NOTHING = 1e-8  # information added, so that every parameter has a finite uncertainty
@@ -26,21 +25,17 @@ _ROUNDING = 1e-14  # fraction of a parameter's information that is rounding
 _NONE = 1e12  # information with which departures are zero
 SEARCHED = 24  # draws that the search for levels averages over
 _SEARCHED_WITH_DEPARTURES = 2  # the same with departures: more parameters, close to the estimate
-_PLACES = 24  # candidates over which the uncertainty of the response is averaged
 
 
 @dataclass(frozen=True)
 class Expected:
-    """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one."""
+    """Predicted relative standard uncertainty of a quantity."""
 
-    value: float  # of the fit or posterior, or the middle of ranges; NaN for the response
+    value: float  # of the fit or posterior, or the middle of ranges
     # relative standard uncertainty from the earlier data, and with the plan's data: the geometric
     # mean over the draws; inf without any information
     before: float
     after: float
-    low: float  # tenth and ninetieth percentile of `after` over the draws
-    high: float
-    scatter_share: float  # fraction of the variance that is due to scatter between runs
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,7 @@ class Forecast:
     before: FloatArray  # (S, Q, Q) information of the earlier data as in their fit
     # (S, Q, Q) the same for the choice of levels: with ranges, and an assumed model error
     searched: FloatArray
-    # (S, Q, c) relative changes of each quantity; the squares of several columns are added
+    # (S, Q) relative changes of each quantity
     directions: Mapping[str, FloatArray]
     scatter: float  # standard deviation of ln gain and phase between runs
     model_error: str  # {"none", "assumed", "estimated"} of the earlier fit
@@ -77,13 +72,11 @@ class Forecast:
             scaled = knowledge.between / units**2
             between = np.diag(np.pad(scaled, (0, known.shape[-1] - units.size)))
         directions, positive = {}, [p.positive for p in knowledge.parameters]
-        for name in (*knowledge.names, *(n for n in question.target if n != RESPONSE)):
+        for name in (*knowledge.names, *question.target):
             change = np.zeros((len(known), known.shape[-1]))
             powers = powers_of(name, knowledge.names)
             change[:, : units.size] = powers * units / np.where(positive, 1.0, knowledge.values)
-            directions[name] = change[..., None]
-        if RESPONSE in question.target:
-            directions[RESPONSE] = _response(candidates)
+            directions[name] = change
         return cls(
             knowledge,
             candidates,
@@ -121,9 +114,8 @@ class Forecast:
         )
         if not target:
             return criterion
-        columns = [self.directions[n] * least_factor(n) / u for n, u in target.items()]
-        starts = np.cumsum([0, *(c.shape[-1] for c in columns[:-1])])
-        return replace(criterion, targets=np.concatenate(columns, axis=-1), starts=starts)
+        columns = [self.directions[name] / u for name, u in target.items()]
+        return replace(criterion, targets=np.stack(columns, axis=-1))
 
     def covariance(self, design: Design) -> FloatArray:
         """Return the covariance of parameters and departures after a design, (S, Q, Q)."""
@@ -132,49 +124,24 @@ class Forecast:
         criterion = Criterion(packed, self.before, self.scatter, between=self.between)
         return covariance_of(self.before + design.runs * criterion.of_run(design.cycles)[0])
 
-    def uncertainty(self, covariance: FloatArray) -> dict[str, FloatArray]:
-        """Return the relative standard uncertainty of every quantity at every draw."""
+    def uncertainty(self, covariance: FloatArray) -> dict[str, float]:
+        """Return the relative standard uncertainty of every quantity, typical of the draws."""
         return {
-            name: np.sqrt(np.einsum("sic,sij,sjc->s", c, covariance, c))
+            name: typical(np.sqrt(np.einsum("si,sij,sj->s", c, covariance, c)))
             for name, c in self.directions.items()
         }
 
-    def after(self, design: Design) -> tuple[dict[str, FloatArray], dict[str, float]]:
-        """Return every quantity's uncertainty at every draw, and the share of scatter in it.
-
-        Expanded uncertainties have the coverage factor of the runs' degrees of freedom.
-        """
-        after = self.uncertainty(self.covariance(design))
-        shares = dict.fromkeys(after, 0.0)
-        if self.scatter > 0.0 or self.between is not None:
-            alike = replace(self, scatter=0.0, between=None)
-            by_noise = self.uncertainty(alike.covariance(design))
-            for name, u in by_noise.items():
-                if np.isfinite(typical(after[name])):
-                    shares[name] = max(0.0, 1.0 - (typical(u) / typical(after[name])) ** 2)
-        for name, share in shares.items():
-            if is_expanded(name):
-                dof = max(design.runs - 1, 1) / share**2 if share > 0.0 else np.inf
-                after[name] = coverage_factor(dof) * after[name]
-        return after, shares
+    def after(self, design: Design) -> dict[str, float]:
+        """Return the uncertainty of every quantity after a design."""
+        return self.uncertainty(self.covariance(design))
 
     def expected(self, design: Design) -> dict[str, Expected]:
         """Return the expected uncertainty of each quantity after a design."""
-        after, shares = self.after(design)
         before = self.uncertainty(covariance_of(self.before))
         values, names = self.knowledge.stated, self.knowledge.names
         return {
-            name: Expected(
-                value=np.nan
-                if name == RESPONSE
-                else float(np.prod(values ** powers_of(name, names))),
-                before=least_factor(name) * typical(before[name]),
-                after=typical(u),
-                low=_shown(float(np.quantile(u, 0.1))),
-                high=_shown(float(np.quantile(u, 0.9))),
-                scatter_share=shares[name],
-            )
-            for name, u in after.items()
+            name: Expected(float(np.prod(values ** powers_of(name, names))), before[name], u)
+            for name, u in self.after(design).items()
         }
 
 
@@ -222,15 +189,6 @@ def _joint(
     return plain, joint + ranges
 
 
-def _response(candidates: Candidates) -> FloatArray:
-    """Return changes of ln gain and phase, whose summed squares are their mean over levels."""
-    order = np.argsort(np.median(candidates.force, axis=0), kind="stable")
-    part = candidates.only(order[spread(candidates.count, _PLACES)])
-    S, levels, _, Q = part.rows.shape
-    changes = (part.rows / part.weight).reshape(S, -1, Q) / np.sqrt(2.0 * levels)
-    return np.asarray(np.linalg.qr(changes, mode="r")).swapaxes(-1, -2)
-
-
 def covariance_of(M: FloatArray) -> FloatArray:
     """Return the inverse of the information; undetermined directions have a very large variance.
 
@@ -244,8 +202,5 @@ def covariance_of(M: FloatArray) -> FloatArray:
 
 def typical(u: FloatArray) -> float:
     """Return the geometric mean over draws, inf without any information."""
-    return _shown(float(np.exp(np.mean(np.log(np.maximum(u, 1e-300))))))
-
-
-def _shown(u: float) -> float:
-    return u if u < 100.0 else float("inf")
+    mean = float(np.exp(np.mean(np.log(np.maximum(u, 1e-300)))))
+    return mean if mean < 100.0 else float("inf")

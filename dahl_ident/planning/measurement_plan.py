@@ -20,8 +20,8 @@ from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_ran
 from dahl_ident.planning.design import Design, continuous_design
 from dahl_ident.planning.forecast import NOTHING, Expected, Forecast
 from dahl_ident.planning.motion_information import evaluate_motions, trapezoids_within
-from dahl_ident.planning.question import BenchLimits, PlanRequest, is_expanded
-from dahl_ident.planning.search import LONGEST, Search
+from dahl_ident.planning.question import BenchLimits, PlanRequest
+from dahl_ident.planning.search import Search
 from dahl_ident.planning.trajectories import Trapezoid
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
 from dahl_ident.units import Motion, percent, shown_unit, si_unit
@@ -34,10 +34,7 @@ if TYPE_CHECKING:
 _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
-_NEARLY_ALL = 0.99  # fraction of the longest time that counts as all of it, as cycles are whole
-_HOURS = 7200.0  # s, from which the time is stated in hours as well
 _WIDER = 10.0  # factor by which a limit is widened to find its effect
-_COSTLY = _WIDER**0.75  # effect above that of the frequency or the time, its square root
 _MODEL_ERROR = {
     "none": "the model is right",
     "estimated": "the model errs as the earlier data show",
@@ -127,7 +124,7 @@ class Plan:
         Returns
         -------
         pandas.DataFrame
-            Columns ``value, before, after, low, high, scatter_share``; see `Expected`.
+            Columns ``value, before, after``; see `Expected`.
         """
         import pandas as pd
 
@@ -304,8 +301,6 @@ class Plan:
         head = f"{number} {'level' if sines else 'motion'}{'s' if number != 1 else ''}"
         head = f"{self.runs} runs of {head}" if self.runs > 1 else head
         end = "; meets the target" if self.reached else "; does NOT meet the target"
-        if all(self.expected[name].before <= most for name, most in self.target.items()):
-            end += ", which the data at hand meet already"
         rows = [
             (
                 name,
@@ -316,46 +311,18 @@ class Plan:
             )
             for name, e in self.expected.items()
         ]
-        hours = f" ({self.seconds / 3600.0:.2g} h)" * (self.seconds >= _HOURS)
-        legend = "Relative standard uncertainties"
-        if any(map(is_expanded, self.expected)):
-            legend += "; U(...) expanded, 95.45 %"
         return "\n".join(
             [
-                f"{head} in {self.seconds:.4g} s{hours}{end if self.target else ''}.",
+                f"{head} in {self.seconds:.4g} s{end if self.target else ''}.",
                 "",
                 self._table(),
                 "",
                 table([("", "value", "before", "after", "wanted"), *rows]),
-                f"{legend}.",
+                "Relative standard uncertainties.",
                 *(f"{text}." for text in self.undetermined),
-                *self._spare(),
                 f"Assumed: {'; '.join(self.assumptions)}.",
             ]
         )
-
-    def _spare(self) -> list[str]:
-        """Return the gain if the remaining time is used or a limit is wider, and how to use it."""
-        time = self.search.question.limits.time
-        if self.reached and np.isinf(time):
-            widened = {name: _widened(self.search, name) for name in self.target}
-            return [
-                f"The limit of {limit} costs time: if it were ten times wider, {name} would be as "
-                f"certain in 1/{gain**2:.2g} of the time."
-                for name, (limit, gain) in widened.items()
-                if gain > _COSTLY
-            ]
-        if not (self.reached and self.seconds < 0.5 * time):
-            return []
-        with_all = self.search.expected_after(time)
-        gain = ", ".join(f"{name} {percent(with_all[name].after, 3)}" for name in self.target)
-        lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {gain}."]
-        if self.runs == 1:
-            lines.append(
-                f"Repeat the plan in {min(5, int(time // self.seconds))} runs, each a new "
-                "mounting: only runs show the scatter between them; longer ones do not reduce it."
-            )
-        return lines
 
     def _table(self) -> str:
         """Return the steps as text, one line each."""
@@ -420,8 +387,8 @@ def undetermined(
     }
     for name, u in q.target.items() if q.has_numbers else ():
         if expected[name].after > 1.001 * u:
-            what = "" if is_expanded(name) else "a standard uncertainty of "
-            missed[name] = f"{name} reaches {what}{_shown(expected[name].after)}, not {_shown(u)}"
+            reached = _shown(expected[name].after)
+            missed[name] = f"{name} reaches a standard uncertainty of {reached}, not {_shown(u)}"
     sentences = [f"{text}; {_prevented_by(search, name)}" for name, text in missed.items()]
     if not search.can_be_judged(design):
         sentences.append(
@@ -431,8 +398,8 @@ def undetermined(
     return tuple(sentences)
 
 
-def _widened(search: Search, name: str) -> tuple[str, float]:
-    """Return the limit that, ten times wider, would reduce an uncertainty most, and how far."""
+def _prevented_by(search: Search, name: str) -> str:
+    """Return the limit that prevents a smaller uncertainty."""
     q, widened = search.question, {"": np.inf}
     base = _least_uncertainty(q, name, q.limits)
     for limit in q.limits.stated:
@@ -443,20 +410,12 @@ def _widened(search: Search, name: str) -> tuple[str, float]:
     if np.isfinite(q.limits.time):
         widened["time"] = base / np.sqrt(_WIDER)
     best = min(widened, key=widened.__getitem__)
-    return best.removesuffix("_hz"), base / widened[best]
-
-
-def _prevented_by(search: Search, name: str) -> str:
-    """Return the limit that prevents a smaller uncertainty."""
-    limit, gain = _widened(search, name)
-    if not limit:
-        return "no limit was stated that prevents it"
+    gain = base / widened[best]
     if not gain > 1.25:
-        if search.forecast.model_error == "estimated":
-            return "no limit alone prevents it: use a model that describes the data better"
-        return "no limit alone prevents it: reduce the noise, or fix a parameter"
+        return "no limit alone prevents it: reduce the noise, or use a model that fits better"
     return (
-        f"the limit of {limit} prevents it: ten times wider, it would be {gain:.2g} times smaller"
+        f"the limit of {best.removesuffix('_hz')} prevents it: ten times wider, it would be "
+        f"{gain:.2g} times smaller"
     )
 
 
@@ -471,7 +430,7 @@ def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits) ->
     return float(np.exp(-0.5 * design.value))
 
 
-def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
+def assumptions_of(search: Search) -> tuple[str, ...]:
     """Return the assumptions of the prediction."""
     q, known = search.question, search.question.knowledge
     force, length = (si_unit(kind, known.motion) for kind in ("force", "displacement"))
@@ -506,8 +465,6 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
                 "model to plan without)"
             )
     texts += [_MODEL_ERROR[search.forecast.model_error], "calibrations are exact"]
-    if design.seconds > _NEARLY_ALL * LONGEST and not np.isfinite(q.limits.time):
-        texts.append("no plan takes more than 30 days unless a time is given")
     return tuple(texts)
 
 

@@ -24,7 +24,6 @@ from dahl_ident.planning.measurement_plan import (
     undetermined,
 )
 from dahl_ident.planning.question import (
-    RESPONSE,
     BenchLimits,
     PlanRequest,
     limit,
@@ -69,11 +68,9 @@ def plan(
         seconds in total.
     target : mapping, sequence of str, or str, optional
         Mapping from a parameter, or a product of powers such as ``"f_max/sigma"``, to its target
-        relative standard uncertainty, or from ``"U(f_max)"`` to its relative expanded uncertainty
-        (95.45 %): the plan meets all targets in the least time. Names only: the plan minimises
-        their uncertainty in ``limits["time"]``. By default the plan is D-optimal in that time.
-        ``"response"`` is the device's response over the candidates, root mean square of ln gain
-        and phase.
+        relative standard uncertainty: the plan meets all targets in the least time. Names only:
+        the plan minimises their uncertainty in ``limits["time"]``. By default the plan is
+        D-optimal in that time.
     ranges : mapping of str to (float, float), optional
         Range that contains a parameter with 95 % probability. The search uses it, but the predicted
         uncertainty does not include it.
@@ -168,7 +165,6 @@ def plan(
     motions = motions_among(candidates)
     if motions:
         for_sines_only = {
-            "target 'response'": RESPONSE in targets,
             "scatter": bool(scatter),
             "runs": runs not in (None, 1),
             argument("controlled", "force"): controlled == "force",
@@ -250,7 +246,7 @@ def _plan(search: Search, design: Design) -> Plan:
         target=dict(q.target) if q.has_numbers else {},
         reached=search.reached(design),
         undetermined=undetermined(search, design, expected),
-        assumptions=assumptions_of(search, design),
+        assumptions=assumptions_of(search),
         change_over=change_over,
         motion=q.knowledge.motion,
         search=search,

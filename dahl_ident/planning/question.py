@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, positive_number
-from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.errors import ValidationError, argument, choices, spelled
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.trajectories import Trapezoid
 
-RESPONSE = "response"
 _POWER = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\^(?P<power>-?\d+(?:\.\d+)?))?")
-_EXPANDED = re.compile(r"U\((?P<quantity>.+)\)")
 
 
 def limit(name: str) -> str:
@@ -196,26 +193,10 @@ def target_of(target: Any) -> tuple[dict[str, float], bool]:
     return checked, bool(checked)
 
 
-# Quantities: parameters, products of their powers, U(...) of either, the predicted response
-
-
-def is_expanded(name: str) -> bool:
-    """Return whether a quantity is an expanded uncertainty, ``U(...)``."""
-    return _EXPANDED.fullmatch(name) is not None
-
-
-def least_factor(name: str) -> float:
-    """Return the least coverage factor of an expanded uncertainty; 1 for others."""
-    return coverage_factor(np.inf) if is_expanded(name) else 1.0
-
-
 def powers_of(expression: str, names: tuple[str, ...]) -> FloatArray:
     """Return the power of each parameter in a product such as ``sigma^2/f_max``."""
-    text = expression.replace(" ", "")
-    expanded = _EXPANDED.fullmatch(text)
-    product = expanded["quantity"] if expanded else text
     powers = np.zeros(len(names))
-    for i, part in enumerate(product.split("/")):
+    for i, part in enumerate(expression.replace(" ", "").split("/")):
         for factor in part.split("*"):
             match = _POWER.fullmatch(factor)
             if match is None:

@@ -13,7 +13,7 @@ from dahl_ident.diagnostics.trends import LEAST_DOF, LEAST_RANGE
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime, Candidates
 from dahl_ident.planning.design import Coverage, Design, Exchange, continuous_design
-from dahl_ident.planning.forecast import Expected, Forecast, typical
+from dahl_ident.planning.forecast import Expected, Forecast
 from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
 from dahl_ident.planning.question import PlanRequest, limit
@@ -117,8 +117,8 @@ class Search:
     def ratio(self, design: Design) -> float:
         """Return the largest ratio of an uncertainty to its target, 0 without any."""
         target = self.question.target if self.question.has_numbers else {}
-        after = self.forecast.after(design)[0] if target else {}
-        return max((typical(after[name]) / u for name, u in target.items()), default=0.0)
+        after = self.forecast.after(design) if target else {}
+        return max((after[name] / u for name, u in target.items()), default=0.0)
 
     def least_time(self) -> Design | None:
         """Return the shortest plan that reaches the targets, or the best in the time allowed.
