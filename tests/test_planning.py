@@ -116,7 +116,6 @@ class TestModelError:
         R = there.predict(errors.theta)
         slopes = there.prediction_jacobian(errors.theta) / R[:, None]
         found = bands.departures(errors, slopes, A, omega, R)
-        assert not found.assumed
         lever = np.concatenate([np.stack([slopes.real, slopes.imag], 1), found.columns], axis=-1)
         covariance = lever @ np.linalg.inv(found.information) @ lever.swapaxes(1, 2)
         expected = bands.prediction_error(errors, slopes, A, omega, R, of_a_test=False).covariance

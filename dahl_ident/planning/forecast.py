@@ -22,7 +22,6 @@ from dahl_ident.units import DEFINITIONS
 
 NOTHING = 1e-8  # information added, so that every parameter has a finite uncertainty
 _ROUNDING = 1e-14  # fraction of a parameter's information that is rounding
-_NONE = 1e12  # information with which departures are zero
 SEARCHED = 24  # draws that the search for levels averages over
 _SEARCHED_WITH_DEPARTURES = 2  # the same with departures: more parameters, close to the estimate
 
@@ -46,12 +45,10 @@ class Forecast:
     # with derivatives with respect to scaled parameters and W departures, Q in all
     candidates: Candidates
     before: FloatArray  # (S, Q, Q) information of the earlier data as in their fit
-    # (S, Q, Q) the same for the choice of levels: with ranges, and an assumed model error
-    searched: FloatArray
+    searched: FloatArray  # (S, Q, Q) the same for the choice of levels, with ranges
     # (S, Q) relative changes of each quantity
     directions: Mapping[str, FloatArray]
     scatter: float  # standard deviation of ln gain and phase between runs
-    model_error: str  # {"none", "assumed", "estimated"} of the earlier fit
     departures: int  # number of departures, W
     between: FloatArray | None = None  # (Q, Q) covariance of parameters between runs
 
@@ -59,14 +56,16 @@ class Forecast:
     def of(cls, question: PlanRequest, candidates: Candidates) -> Forecast:
         """Return the forecast of a question's quantities for candidates."""
         knowledge, units = question.knowledge, question.knowledge.units
-        rows, square = candidates.rows * units, np.outer(units, units)
-        known = knowledge.information * square
-        searched = known + np.diag(knowledge.prior) * square
-        error, model_error = _departures(knowledge, candidates), "none"
+        rows, scale = candidates.rows * units, units
+        information, prior = knowledge.information, knowledge.prior
+        error = _departures(knowledge, candidates)
         if error is not None:
-            model_error = "assumed" if error.assumed else "estimated"
             rows = np.concatenate([rows, error.columns * candidates.weight], axis=-1)
-            known, searched = _joint(known, searched, error, units)
+            W = error.columns.shape[-1]
+            scale, prior = np.append(units, np.ones(W)), np.append(prior, np.zeros(W))
+            information = np.broadcast_to(error.information, (len(information), *2 * scale.shape))
+        known = information * np.outer(scale, scale)
+        searched = known + np.diag(prior * scale**2)
         candidates, between = replace(candidates, rows=rows), None
         if knowledge.between is not None:
             scaled = knowledge.between / units**2
@@ -84,7 +83,6 @@ class Forecast:
             searched,
             directions,
             question.scatter,
-            model_error,
             departures=known.shape[-1] - units.size,
             between=between,
         )
@@ -167,26 +165,6 @@ def _departures(knowledge: Knowledge, candidates: Candidates) -> Departures | No
     return error._replace(
         columns=sign * error.columns, information=error.information[np.ix_(kept, kept)]
     )
-
-
-def _joint(
-    known: FloatArray, searched: FloatArray, error: Departures, units: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the information on parameters and departures: as in the fit, and for the search.
-
-    The first does not include a model error that is only assumed.
-    """
-    P, W = len(units), error.columns.shape[-1]
-    scale = np.concatenate([units, np.ones(W)])
-    joint = np.broadcast_to(error.information * np.outer(scale, scale), (len(known), P + W, P + W))
-    ranges = np.zeros((P + W, P + W))
-    ranges[:P, :P] = (searched - known)[0]
-    if not error.assumed:
-        return joint, joint + ranges
-    plain = np.zeros(joint.shape)
-    plain[:, :P, :P] = known
-    plain[:, P:, P:] = _NONE * np.eye(W)
-    return plain, joint + ranges
 
 
 def covariance_of(M: FloatArray) -> FloatArray:

@@ -35,12 +35,6 @@ _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
 _WIDER = 10.0  # factor by which a limit is widened to find its effect
-_MODEL_ERROR = {
-    "none": "the model is right",
-    "estimated": "the model errs as the earlier data show",
-    "assumed": "levels chosen as if the model erred by the noise of the earlier data, "
-    "which are too few to tell one from the other",
-}
 
 
 @dataclass(frozen=True)
@@ -464,7 +458,8 @@ def assumptions_of(search: Search) -> tuple[str, ...]:
                 f"{', '.join(known.assumed)} within the range that a fit assumes (fix it in the "
                 "model to plan without)"
             )
-    texts += [_MODEL_ERROR[search.forecast.model_error], "calibrations are exact"]
+    errs = "errs as the earlier data show" if search.forecast.departures else "is right"
+    texts += [f"the model {errs}", "calibrations are exact"]
     return tuple(texts)
 
 

@@ -121,9 +121,8 @@ def plan(
     Notes
     -----
     A plan from a fit takes the fit's noise, model error and scatter between runs. The model error
-    is similar at levels close to each other, so levels are spread; if the earlier data are too few
-    to distinguish it from noise, levels are chosen as if both were equally large. A plan from a
-    posterior has no model error.
+    is similar at levels close to each other, so levels are spread. A plan from a posterior has no
+    model error.
 
     Without earlier data, a plan has as many levels as a fit needs to distinguish a wrong model from
     noise; if the time does not allow so many, the target is not met.
