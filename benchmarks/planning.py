@@ -26,11 +26,12 @@ import numpy as np
 
 import dahl_ident as di
 from benchmarks.coverage import F_MAX, SIGMA, X_C
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Model
 from dahl_ident.fitting import solve_many
 from dahl_ident.planning import Plan
+from dahl_ident.planning.search import Search
 from dahl_ident.problem import ProblemBatch
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.synthetic.waveform import WaveformBuilder
@@ -290,9 +291,8 @@ def compare(scenario: Scenario, count: int, seed: int, whole: int = 0) -> Iterat
     With `count` tables and `whole` experiments of each design.
     """
     first = scenario.plan(1e6, None, candidates=60)
-    bench, grid = first.search.bench, first.search.logarithmic_grid(1e6, scenario.levels)
-    assert grid is not None
-    levels = grid.levels
+    bench = first.search.bench
+    levels = bench.order(_grid(first.search, scenario.levels))
     time = bench.seconds(levels, np.full(len(levels), float(CYCLES)))
     options = first.search.forecast.candidates
     even = Design(
@@ -316,6 +316,22 @@ def compare(scenario: Scenario, count: int, seed: int, whole: int = 0) -> Iterat
                 got[name], base[name], run.get(name, np.nan), base_whole.get(name, np.nan),
                 whole,
             )  # fmt: skip
+
+
+def _grid(search: Search, count: int) -> IntArray:
+    """Return an even logarithmic grid of levels; of several frequencies, a third at three."""
+    c = search.forecast.candidates
+    groups, frequencies = [np.arange(c.count)], np.unique(c.frequency_hz)
+    rate_free = search.question.knowledge.model.rate_independent
+    if len(frequencies) > 2 and not (rate_free and c.controlled == "displacement"):
+        three = frequencies[[0, len(frequencies) // 2, -1]]
+        groups = [np.flatnonzero(c.frequency_hz == f) for f in three]
+    chosen: list[int] = []
+    for group in groups:
+        level = np.log(c.level[group])
+        places = np.linspace(level.min(), level.max(), max(count // len(groups), 2))
+        chosen += [int(group[np.argmin(np.abs(level - p))]) for p in places]
+    return np.unique(chosen)
 
 
 # Sequences

@@ -191,7 +191,7 @@ class TestPlan:
 
     def test_the_curve_goes_through_the_plan(self):
         plan = _plan("trapezoid", {}, target={"f_max": 0.002, "sigma": 0.003})
-        for name, (times, planned, _) in plan.curves().items():
+        for name, (times, planned) in plan.curves().items():
             at = times.tolist().index(plan.seconds)
             assert planned[at] == plan.expected[name].after <= plan.target[name]
             assert (np.diff(planned[np.isfinite(planned)]) < 0.0).all()

@@ -250,27 +250,22 @@ class Plan:
         write_whole(place, json.dumps(plain, indent=2).encode(), overwrite=overwrite)
         return place
 
-    def curves(self) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return time, uncertainty by plans and by a logarithmic grid, for each quantity.
+    def curves(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return times and the uncertainty by plans of these times, for each quantity.
 
-        The quantities are the targets, or all parameters if time was given. The grid has ten levels
-        with equal cycles; uncertainties are NaN if the time is too short.
+        The quantities are the targets, or all parameters if time was given; uncertainties are NaN
+        if the time is too short.
         """
         times = self.seconds * np.array(_CURVE)
-        search = self.search
-        planned = [self.expected if t == self.seconds else search.expected_after(t) for t in times]
-        gridded = [search.expected_after(t, grid=True) for t in times]
-
-        def after(name: str, plans: Sequence[Mapping[str, Expected]]) -> FloatArray:
-            return np.array([e[name].after if e else np.nan for e in plans])
-
+        after = self.search.expected_after
+        plans = [self.expected if time == self.seconds else after(time) for time in times]
         return {
-            name: (times, after(name, planned), after(name, gridded))
+            name: (times, np.array([plan[name].after if plan else np.nan for plan in plans]))
             for name in self.target or self.expected
         }
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Plot the predicted uncertainty over bench time, and that of a logarithmic grid.
+        """Plot the predicted uncertainty over bench time.
 
         Parameters
         ----------

@@ -25,7 +25,6 @@ _LONGER = 4.0  # factor from one time to the next until a target is reached
 _HELPS = 0.1  # more time is useless below this fraction of the gain by the square root of time
 _CLOSE = 0.985  # fraction of the plan's time in which the target is not reached any more
 _APART = 2.0  # span of levels, in ranges that a fit takes as one amplitude: these are not exact
-_GRID_LEVELS = 10  # levels of the usual logarithmic plan with which the best one is compared
 _FILLED = 0.999  # fraction of the target that corrected repeats aim at
 
 
@@ -168,33 +167,7 @@ class Search:
             if not (q.has_numbers and possible) or design.ratio <= 1.0:
                 return design
 
-    def expected_after(self, time: float, *, grid: bool = False) -> dict[str, Expected]:
-        """Return what the best plan of a time, or a grid, determines; empty if it is too short."""
-        design = self.logarithmic_grid(time) if grid else self.solve(time)
+    def expected_after(self, time: float) -> dict[str, Expected]:
+        """Return what the best plan of a time determines; empty if it is too short."""
+        design = self.solve(time)
         return {} if design is None else self.forecast.expected(design)
-
-    def logarithmic_grid(self, time: float, levels: int = _GRID_LEVELS) -> Design | None:
-        """Return an even logarithmic grid of levels, equal cycles at each.
-
-        In the same order and with the same settling; of several frequencies a third of the levels
-        at each of three. None where the time is too short.
-        """
-        c, rate_free = self.forecast.candidates, self.question.knowledge.model.rate_independent
-        frequencies, groups = np.unique(c.frequency_hz), [np.arange(c.count)]
-        single = c.motions or (rate_free and self.question.controlled == "displacement")
-        if not single and len(frequencies) > 2:
-            three = frequencies[[0, len(frequencies) // 2, -1]]
-            groups = [np.flatnonzero(c.frequency_hz == f) for f in three]
-        chosen: list[int] = []
-        for group in groups:
-            level = np.log(c.level[group])
-            places = np.linspace(level.min(), level.max(), max(levels // len(groups), 2))
-            chosen += [int(group[np.argmin(np.abs(level - p))]) for p in places]
-        ordered, runs = self.bench.order(np.unique(chosen)), self.question.runs or 1
-        room = time / runs - self.bench.fixed(ordered)
-        cycles = np.floor(room / float((1.0 / c.frequency_hz[ordered]).sum()))
-        if cycles < 1.0:
-            return None
-        each = np.full(len(ordered), cycles)
-        seconds = runs * self.bench.seconds(ordered, each)
-        return Design(ordered, each, runs, np.nan, seconds)
