@@ -16,14 +16,12 @@ homogeneous function of the information, so that the search for the best design 
 - targets: -ln(sum_t (c_t' M^{-1} c_t / u_t^2)^q)/q; with one target c-optimality, with several
   close to the largest ratio of variance to target.
 
-**Continuous designs** are seconds t_k at each candidate, with a fixed sum. With d_k the derivative
-of the criterion with respect to t_k and d the mean of d_k weighted by t_k, every t_k is multiplied
-by (d_k/d)^p; at the optimum d_k <= d everywhere (the equivalence theorem), with equality where
-t_k > 0. For D-optimality without earlier data d times the time is 1.
-
-**With fixed costs** each level needs time for change-over and settling before it gives information.
-Levels are added, exchanged and removed one at a time while this improves the criterion, and the
-remaining time is distributed by the same multiplication; then cycles are rounded to whole numbers.
+Each level needs time for change-over and settling before it gives information. Levels are added,
+exchanged and removed one at a time while this improves the criterion, and the remaining time is
+distributed over them: with d_k the derivative of the criterion with respect to the seconds t_k of a
+level and d the mean of d_k weighted by t_k, every t_k is multiplied by (d_k/d)^p; at the optimum
+d_k <= d everywhere (the equivalence theorem), with equality where t_k > 0. Then cycles are rounded
+to whole numbers.
 
 Source: Pukelsheim, *Optimal Design of Experiments*, 2006, chapters 3 and 5; Silvey, Titterington
 and Torsney, *Commun. Stat. A* 7, 1379 (1978); Yu, *Ann. Stat.* 38, 1593 (2010).
@@ -131,39 +129,14 @@ class Criterion:
         return value, (inverse_c * share[..., None, :]) @ inverse_c.swapaxes(-1, -2)
 
 
-class ContinuousDesign(NamedTuple):
-    """Seconds at each candidate, the criterion, and the largest d_k/d - 1: 0 at the optimum."""
-
-    seconds: FloatArray
-    value: float
-    excess: float
-
-
-def continuous_design(
-    criterion: Criterion,
-    frequency_hz: FloatArray,
-    time: float,
-    *,
-    tolerance: float = 0.01,
-    iterations: int = 400,
-) -> ContinuousDesign:
-    """Return the best seconds at each candidate, without settling and change-over."""
-    even = np.full(len(frequency_hz), time / len(frequency_hz))
-    seconds = _best_seconds(criterion, frequency_hz, time, even, iterations, tolerance)
-    value, sensitivities = criterion.at(seconds * frequency_hz)
-    rate = criterion.gradient(sensitivities) * frequency_hz
-    excess = rate.max() / (rate @ seconds / time) - 1.0
-    return ContinuousDesign(seconds, float(value), float(excess))
-
-
-def _best_seconds(
+def best_seconds(
     criterion: Criterion,
     frequency_hz: FloatArray,
     time: FloatArray | float,
     start: FloatArray,
     iterations: int,
     tolerance: float,
-    least: FloatArray | float = 0.0,
+    least: FloatArray | float,
 ) -> FloatArray:
     """Return the best distribution of each design's `time` over its levels, (..., m).
 
@@ -225,10 +198,9 @@ class Exchange:
         self,
         criterion: Criterion,
         bench: BenchTime,
-        pool: IntArray,
         coverage: Coverage | None = None,
     ) -> None:
-        self._criterion, self._bench, self._pool = criterion, bench, pool
+        self._criterion, self._bench = criterion, bench
         self._coverage = coverage or Coverage(1, 0.0, np.zeros(len(bench.frequency_hz)))
 
     def best(self, time: float, start: Sequence[int] = ()) -> Design | None:
@@ -269,7 +241,7 @@ class Exchange:
         spare = (time - self._bench.fixed(levels) - least.sum(axis=-1))[..., None]
         sub = self._criterion.only(levels)
         shared = np.maximum(spare, _NO_TIME)
-        seconds = _best_seconds(sub, f, shared, np.ones(f.shape), iterations, 0.003, least)
+        seconds = best_seconds(sub, f, shared, np.ones(f.shape), iterations, 0.003, least)
         cycles = (least + np.where(spare > 0.0, seconds, 0.0)) * f
         return sub, np.where(spare >= 0.0, cycles, np.nan)
 
@@ -290,7 +262,7 @@ class Exchange:
 
     def _promising(self, chosen: list[int], time: float) -> list[int]:
         """Return the candidates that are best in addition to the chosen ones, at equal times."""
-        others = np.setdiff1d(self._pool, chosen)
+        others = np.setdiff1d(np.arange(len(self._bench.frequency_hz)), chosen)
         joined = np.column_stack([np.tile(chosen, (others.size, 1)), others]).astype(np.intp)
         least = (LEAST_CYCLES / self._bench.frequency_hz[joined]).sum(axis=-1)
         spare = time - self._bench.fixed(joined) - least

@@ -100,15 +100,16 @@ class Forecast:
             directions={name: d[some] for name, d in self.directions.items()},
         )
 
-    def criterion(
-        self, target: Mapping[str, float], known: FloatArray | None = None, runs: int = 1
-    ) -> Criterion:
+    def criterion(self, target: Mapping[str, float]) -> Criterion:
         """Return the criterion: uncertainties over their targets, or D-optimality."""
         c = self.candidates
         packed = packed_information(c.rows, c.offsets, self.scatter)
-        known = self.searched if known is None else known
         criterion = Criterion(
-            packed, known, self.scatter, runs, between=self.between, departures=self.departures
+            packed,
+            self.searched,
+            self.scatter,
+            between=self.between,
+            departures=self.departures,
         )
         if not target:
             return criterion

@@ -17,8 +17,8 @@ from dahl_ident.diagnostics.formatting import listed, table
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
 from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_range
-from dahl_ident.planning.design import Design, continuous_design
-from dahl_ident.planning.forecast import NOTHING, Expected, Forecast
+from dahl_ident.planning.design import Design
+from dahl_ident.planning.forecast import Expected
 from dahl_ident.planning.motion_information import evaluate_motions, trapezoids_within
 from dahl_ident.planning.question import BenchLimits, PlanRequest
 from dahl_ident.planning.search import Search
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
-_FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
+_FEW_LEVELS = 30  # candidates from which the effect of a wider limit is computed
 _WIDER = 10.0  # factor by which a limit is widened to find its effect
 
 
@@ -378,7 +378,9 @@ def undetermined(
         if expected[name].after > 1.001 * u:
             reached = _shown(expected[name].after)
             missed[name] = f"{name} reaches a standard uncertainty of {reached}, not {_shown(u)}"
-    sentences = [f"{text}; {_prevented_by(search, name)}" for name, text in missed.items()]
+    sentences = [
+        f"{text}; {_prevented_by(search, name, design.seconds)}" for name, text in missed.items()
+    ]
     if not search.can_be_judged(design):
         sentences.append(
             "these levels are too few to tell a wrong model from noise, so that a fit to them "
@@ -387,17 +389,17 @@ def undetermined(
     return tuple(sentences)
 
 
-def _prevented_by(search: Search, name: str) -> str:
+def _prevented_by(search: Search, name: str, time: float) -> str:
     """Return the limit that prevents a smaller uncertainty."""
     q, widened = search.question, {"": np.inf}
-    base = _least_uncertainty(q, name, q.limits)
+    base = _least_uncertainty(q, name, q.limits, time)
     for limit in q.limits.stated:
         low, high = getattr(q.limits, limit)
         wider: dict[str, Any] = {limit: (low / _WIDER, high * _WIDER)}
         with suppress(ValidationError):
-            widened[limit] = _least_uncertainty(q, name, replace(q.limits, **wider))
+            widened[limit] = _least_uncertainty(q, name, replace(q.limits, **wider), time)
     if np.isfinite(q.limits.time):
-        widened["time"] = base / np.sqrt(_WIDER)
+        widened["time"] = _least_uncertainty(q, name, q.limits, _WIDER * time)
     best = min(widened, key=widened.__getitem__)
     gain = base / widened[best]
     if not gain > 1.25:
@@ -408,15 +410,11 @@ def _prevented_by(search: Search, name: str) -> str:
     )
 
 
-def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits) -> float:
-    """Return the uncertainty of a quantity with the best continuous design."""
-    candidates = candidates_within(question, limits)
-    few = Forecast.of(question, candidates).thinned()
-    criterion = few.criterion({name: 1.0}, few.before + NOTHING * np.eye(few.before.shape[-1]))
-    time = limits.time if np.isfinite(limits.time) else 1000.0
-    frequency_hz = candidates.frequency_hz
-    design = continuous_design(criterion, frequency_hz, time, tolerance=0.1)
-    return float(np.exp(-0.5 * design.value))
+def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits, time: float) -> float:
+    """Return the least uncertainty of a quantity after a time."""
+    question = replace(question, target={name: 1.0}, has_numbers=False, limits=limits)
+    expected = Search(question, candidates_within(question, limits)).expected_after(time)
+    return expected[name].after if expected else np.inf
 
 
 def assumptions_of(search: Search) -> tuple[str, ...]:

@@ -46,7 +46,7 @@ def plan(
     scatter: float | None = None,
     runs: int | None = None,
     controlled: str = "displacement",
-    candidates: int | str | Sequence[tuple[float, float]] | Sequence[Trapezoid] = 240,
+    candidates: int | str | Sequence[tuple[float, float]] | Sequence[Trapezoid] = 80,
     change_over: float = 1.0,
     settled: float = 0.01,
     between_runs: float = 0.0,
@@ -86,7 +86,7 @@ def plan(
         Number of runs. By default the best one: 1 without scatter, otherwise up to 8.
     controlled : {"displacement", "force"}
         The controlled quantity. With "force", levels are drives of the whole plant.
-    candidates : int, sequence of (level, frequency_hz), str, or sequence of motions, default 240
+    candidates : int, sequence of (level, frequency_hz), str, or sequence of motions, default 80
         The levels to choose from, or their number. ``"trapezoid"`` stands for trapezoidal motions
         in time within the limits, to be fitted as records; or give a list of
         :class:`dahl_ident.planning.Trapezoid`.

@@ -8,17 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from dahl_ident.arrays import IntArray
 from dahl_ident.diagnostics.trends import LEAST_DOF, LEAST_RANGE
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime, Candidates
-from dahl_ident.planning.design import Coverage, Design, Exchange, continuous_design
+from dahl_ident.planning.design import Coverage, Design, Exchange
 from dahl_ident.planning.forecast import Expected, Forecast
-from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
 from dahl_ident.planning.question import PlanRequest, limit
 
-_POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # to average scatter between runs: a ninth run would gain 6 %
 LONGEST = 30.0 * 86400.0  # s: a month, the longest plan if no time is given
 _LONGER = 4.0  # factor from one time to the next until a target is reached
@@ -44,7 +41,6 @@ class Search:
             self.bench = BenchTime.of(candidates, knowledge, **question.costs)
         self.forecast = Forecast.of(question, candidates)
         self._criterion = self.forecast.thinned().criterion(question.target)
-        self._pool: IntArray | None = None
 
     def best(self) -> Design:
         """Return the shortest plan that reaches the targets, or the best in the time allowed."""
@@ -65,7 +61,7 @@ class Search:
         most = _MOST_RUNS if q.scatter > 0.0 or self.forecast.between is not None else 1
         for runs in (q.runs,) if q.runs else range(1, most + 1):
             criterion = replace(self._criterion, runs=runs)
-            search = Exchange(criterion, self.bench, self._promising(time), self._coverage)
+            search = Exchange(criterion, self.bench, self._coverage)
             design = search.best(time / runs, start)
             if design is None or (best is not None and design.value <= best.value):
                 break
@@ -94,24 +90,6 @@ class Search:
         """Return whether a design reaches every target, with data that can be judged."""
         judged = not self.question.has_numbers or self.can_be_judged(design)
         return bool(design.ratio <= 1.0) and judged
-
-    def _promising(self, time: float) -> IntArray:
-        """Return promising candidates: those of the continuous design, and evenly spread ones."""
-        if self._pool is None:
-            K, f, alone = self.forecast.candidates.count, self.bench.frequency_hz, self.bench.alone
-            if K <= _POOL:
-                self._pool = np.arange(K)
-                return self._pool
-            usual = 0.2 * time if np.isfinite(time) else 20.0 * float(np.median(alone))
-            reachable = alone + LEAST_CYCLES / f <= time
-            rate = f * usual / (usual + alone) * reachable + 1e-12
-            seconds, _, _ = continuous_design(
-                self._criterion, rate, usual, tolerance=0.05, iterations=200
-            )
-            best = np.argsort(-seconds, kind="stable")[: _POOL // 2]
-            even = np.argsort(self.bench.force, kind="stable")[spread(K, _POOL // 2)]
-            self._pool = np.unique(np.concatenate([best[seconds[best] > 0.0], even]))
-        return self._pool
 
     def ratio(self, design: Design) -> float:
         """Return the largest ratio of an uncertainty to its target, 0 without any."""
