@@ -438,18 +438,23 @@ class TestRefusal:
         with pytest.raises(DataError, match="cannot be read: No such file"):
             read_record(tmp_path / "absent.csv")
 
+    @pytest.mark.versions
     @pytest.mark.parametrize(
         ("columns", "message"),
         [
             ({"froce": "F"}, "columns: unknown entry 'froce'; expected one of time, displacement"),
-            ({"force": 3}, "force is 3; expected a column's name"),
-            ({"force": {"col": "F"}}, "force: unknown entry 'col'"),
-            ({"force": {"column": 3}}, "force.column is 3; expected text"),
-            ({"force": {"column": "F", "sign": 2}}, "force.sign is 2; expected 1 or -1"),
-            ({"force": {"column": "F", "factor": -2}}, "force.factor is -2.0"),
+            ({"force": 3}, "force: column is 3; expected a column's name"),
+            (
+                {"force": {"col": "F"}},
+                "columns: force: unknown entry 'col'; .*did you mean 'column'",
+            ),
+            ({"force": {"unit": 3}}, "force: unit is 3; expected text"),
+            ({"force": {"column": "F", "sign": 2}}, "force: sign is 2; expected 1 or -1"),
+            ({"force": {"column": "F", "factor": -2}}, "force: factor is -2.0"),
             ({"force": "load"}, r"no column is called 'load'; there are time, x, F"),
             ({"velocity": {"unit": "mm/s"}}, "no column is called velocity or vel or v"),
             ({"sample_rate": 0}, "sample_rate is 0.0"),
+            ({"sample_rate": "100"}, "sample_rate is '100'; expected a number"),
             ({"drive_factor": 12.5}, "drive_factor is 12.5; expected text such as '12.5 N/V'"),
             ({"quantity": "stiffness"}, "quantity is 'stiffness'"),
             ({"controlled": 5}, "controlled is 5; expected 'displacement' or 'force'"),

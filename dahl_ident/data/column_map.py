@@ -23,29 +23,29 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import starmap
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from dahl_ident.arrays import BoolArray, FloatArray, non_negative_number, positive_number
-from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, RECORD_COLUMNS, Column, one_of
+from dahl_ident.data.columns import (
+    FILE_COLUMNS,
+    RECORD_COLUMNS,
+    Column,
+    Controlled,
+    one_of,
+    set_checked,
+)
+from dahl_ident.data.entries import checked, expecting
 from dahl_ident.data.raw_columns import RawChannel, RawFile, plain
 from dahl_ident.data.storage import read_toml
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import (
-    ANY,
-    DataError,
-    DataWarning,
-    UnitError,
-    ValidationError,
-    argument,
-    choices,
-    spelled,
-)
+from dahl_ident.errors import ANY, DataError, DataWarning, UnitError, argument, choices, spelled
 from dahl_ident.units import (
     MECHANICAL_KINDS,
     QUANTITIES,
@@ -66,10 +66,13 @@ _SHOWN = 10  # most rows named in a warning
 class MappedColumn:
     """The column of a role, by default with its usual name; `unit` replaces that of the file."""
 
-    column: str | None = None
+    column: str | None = expecting("a column's name", default=None)
     unit: str | None = None
-    sign: int = 1
+    sign: Literal[1, -1] = 1
     factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        set_checked(self, positive_number, "factor")
 
 
 @dataclass(frozen=True)
@@ -78,11 +81,22 @@ class ColumnMap:
 
     roles: Mapping[str, MappedColumn] = field(default_factory=dict)
     quantity: Quantity | None = None
-    controlled: str | Mapping[str, str] | None = None
+    controlled: Controlled | dict[Controlled, str] | None = expecting(
+        "'displacement' or 'force', or a pattern of level labels for each of them", default=None
+    )
     sweep: str | None = None
     sample_rate: float | None = None
-    drive_factor: str | None = None
+    drive_factor: str | None = expecting("text such as '12.5 N/V'", default=None)
     drive_factor_uncertainty: float = 0.0
+
+    def __post_init__(self) -> None:
+        set_checked(self, partial(one_of, allowed=QUANTITIES), "quantity")
+        set_checked(self, positive_number, "sample_rate")
+        set_checked(self, non_negative_number, "drive_factor_uncertainty")
+
+
+SETTINGS = tuple(name for name in ColumnMap.__dataclass_fields__ if name != "roles")
+"""Entries of a column map that are not columns."""
 
 
 def column_map_of(entries: Mapping[str, Any]) -> str:
@@ -124,74 +138,16 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
     entries = {**entries, **{key: entry for key, entry in overrides.items() if entry is not None}}
     roles: dict[str, MappedColumn] = {}
     settings: dict[str, Any] = {}
-    try:
-        for key, entry in entries.items():
-            mapped = key in FILE_COLUMNS and isinstance(entry, Mapping) and "column" in entry
-            if key in SETTINGS and not mapped:
-                settings[key] = SETTINGS[key](entry, key)
-            else:
-                roles[key] = _mapped(entry, key)
-    except ValidationError as exc:
-        raise DataError(f"{name}: {exc}") from exc
-    return ColumnMap(roles, **settings)
-
-
-def _mapped(entry: Any, role: str) -> MappedColumn:
-    """Return the column of a role from its entry in a column map, a name or a table."""
-    if role not in FILE_COLUMNS:
-        known = choices((*FILE_COLUMNS, *SETTINGS), role)
-        raise ValidationError(f"unknown entry {role!r}; expected one of {known}")
-    if isinstance(entry, str):
-        return MappedColumn(entry)
-    if not isinstance(entry, Mapping):
-        raise ValidationError(
-            f"{role} is {entry!r}; expected a column's name, or a table with column, unit, sign "
-            "and factor"
-        )
-    for unknown in sorted(entry.keys() - _OF_COLUMN.keys())[:1]:
-        raise ValidationError(
-            f"{role}: unknown entry {unknown!r}; expected column, unit, sign or factor"
-        )
-    return MappedColumn(**{k: _OF_COLUMN[k](v, f"{role}.{k}") for k, v in entry.items()})
-
-
-def _controlled(entry: Any, key: str) -> str | dict[str, str]:
-    if isinstance(entry, str):
-        return one_of(entry, key, CONTROLLED)
-    if isinstance(entry, Mapping) and all(isinstance(v, str) for v in entry.values()):
-        return {one_of(word, key, CONTROLLED): pattern for word, pattern in entry.items()}
-    raise ValidationError(
-        f"{key} is {entry!r}; expected 'displacement' or 'force', or a pattern of level labels "
-        "for each of them"
-    )
-
-
-def _text(entry: Any, key: str) -> str:
-    if not isinstance(entry, str):
-        example = " such as '12.5 N/V'" if key == "drive_factor" else ""
-        raise ValidationError(f"{key} is {entry!r}; expected text{example}")
-    return entry
-
-
-def _sign(entry: Any, key: str) -> int:
-    if entry not in (1, -1):
-        raise ValidationError(f"{key} is {entry!r}; expected 1 or -1")
-    return int(entry)
-
-
-Checks = dict[str, Callable[[Any, str], Any]]
-_OF_COLUMN: Checks = {"column": _text, "unit": _text, "sign": _sign, "factor": positive_number}
-
-
-SETTINGS: Checks = {
-    "quantity": lambda entry, key: one_of(entry, key, QUANTITIES),
-    "controlled": _controlled,
-    "sweep": _text,
-    "sample_rate": positive_number,
-    "drive_factor": _text,
-    "drive_factor_uncertainty": non_negative_number,
-}
-"""Entries of a column map that are not columns, with their checks."""
+    for key, entry in entries.items():
+        column = entry if isinstance(entry, Mapping) else {"column": entry}
+        if key in SETTINGS and not (key in FILE_COLUMNS and entry is column and "column" in entry):
+            settings[key] = entry
+        elif key in FILE_COLUMNS:
+            roles[key] = checked(MappedColumn, column, f"{name}: {key}")
+        else:
+            known = choices((*FILE_COLUMNS, *SETTINGS), key)
+            raise DataError(f"{name}: unknown entry {key!r}; expected one of {known}")
+    return replace(checked(ColumnMap, settings, name) if settings else ColumnMap(), roles=roles)
 
 
 @dataclass

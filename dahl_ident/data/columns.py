@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 from operator import attrgetter
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,7 +34,8 @@ from dahl_ident.units import (
 )
 
 Check = Callable[[ArrayLike, str], NDArray[Any]]
-CONTROLLED = ("displacement", "force")
+Controlled = Literal["displacement", "force"]
+CONTROLLED: tuple[Controlled, ...] = get_args(Controlled)
 
 
 def frozen_copy(array: NDArray[Any]) -> NDArray[Any]:

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from dahl_ident.arrays import non_negative_number, positive_array, positive_number, whole_number
-from dahl_ident.data.columns import one_of, set_checked
+from dahl_ident.data.columns import Controlled, one_of, set_checked
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic.acquisition import Draws
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
 
-Controlled = Literal["displacement", "force"]
 Order = Literal["given", "ascending", "descending", "random"]
 Spacing = Literal["linear", "log"]
 
