@@ -33,21 +33,16 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from dahl_ident.data.columns import one_of
+from dahl_ident.data.entries import checked, expecting
 from dahl_ident.data.storage import read_toml, regular
 from dahl_ident.errors import DataError, ModelError, ValidationError, choices
 
-_TABLES = {"laws", "files", "read", "extract", "fit", "posterior", "model", "output"}
-_FILES = {"pattern", "kind", "covariates"}
-_OUTPUT = {"folder", "per", "reports"}
-_KINDS = ("record", "response")
-_UNITS = ("device", "run")
 _SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "progress"}
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)\}")
 # columns of the table of results, and the beginnings of their names; covariates have other names
@@ -70,6 +65,36 @@ _COLUMNS = {
 }
 _PREFIXES = ("u_", "U_", "dof_", "unit_", "posterior_")
 _BLANK = ("", "na", "n/a", "nan")
+
+
+@dataclass(frozen=True)
+class _Files:
+    pattern: str = expecting("text such as 'data/{device}.csv'")
+    kind: Literal["record", "response"] = "record"
+    covariates: str | None = expecting("the path of a table", default=None)
+
+
+@dataclass(frozen=True)
+class _Output:
+    folder: str = field(
+        default="results", metadata={"description": "the path of a folder", "min_length": 1}
+    )
+    per: Literal["device", "run"] = "device"
+    reports: bool = False
+
+
+@dataclass(frozen=True)
+class _Content:
+    """The content of a definition."""
+
+    files: _Files
+    model: list[dict[str, Any]] = expecting('[[model]] tables, such as kind = "dahl"')
+    laws: str | list[str] = expecting("a path, or a list of paths", default_factory=list)
+    read: dict[str, Any] = field(default_factory=dict)
+    extract: dict[str, Any] = field(default_factory=dict)
+    fit: dict[str, Any] = field(default_factory=dict)
+    posterior: dict[str, Any] | None = None
+    output: _Output = field(default_factory=_Output)
 
 
 @dataclass(frozen=True)
@@ -119,81 +144,44 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         content = read_toml(path, "the campaign")
         name, folder = str(path), path.resolve().parent
     try:
-        return _checked(name, folder, content)
+        json.dumps(content)
+    except TypeError as exc:
+        raise DataError(
+            f"{name}: an option is a date or a time; expected a number or a text in quotes ({exc})"
+        ) from exc
+    known = checked(_Content, content, name)
+    try:
+        return _definition(name, folder, known)
     except (DataError, ModelError, ValidationError) as exc:
         raise DataError(f"{name}: {exc}") from exc
 
 
-def _checked(name: str, folder: Path, content: Mapping[str, Any]) -> Definition:
-    _refuse_unknown("tables", content, _TABLES)
-    files, output = _table(content, "files"), _table(content, "output")
-    _refuse_unknown("options in [files]", files, _FILES)
-    _refuse_unknown("options in [output]", output, _OUTPUT)
-    kind = one_of(files.get("kind", "record"), "[files] kind", _KINDS)
-    per = one_of(output.get("per", "device"), "[output] per", _UNITS)
-    results, reports = output.get("folder", "results"), output.get("reports", False)
-    if not isinstance(results, str) or not results:
-        raise ValidationError(f"[output] folder is {results!r}; expected the path of a folder")
-    if not isinstance(reports, bool):
-        raise ValidationError(f"[output] reports is {reports!r}; expected true or false")
-    _run_laws(folder, content.get("laws", []))
-    model, parameters, laws = _model(content.get("model"))
+def _definition(name: str, folder: Path, content: _Content) -> Definition:
+    from dahl_ident.elements.law_files import load_laws
+
+    for file in [content.laws] if isinstance(content.laws, str) else content.laws:
+        load_laws(folder / file)
+    model, parameters, laws = _model(content.model)
     options = {
-        "kind": kind,
-        "per": per,
+        "kind": content.files.kind,
+        "per": content.output.per,
         "model": model,
-        **{table: _table(content, table) for table in ("read", "extract", "fit")},
-        "posterior": _table(content, "posterior") if "posterior" in content else None,
+        **{table: getattr(content, table) for table in ("read", "extract", "fit", "posterior")},
     }
     if laws:
         options["laws"] = laws
     _check_options(options)
-    tasks = _tasks(folder, files, per)
+    tasks = _tasks(folder, content.files, content.output.per)
     _check_names(tasks, parameters)
-    return Definition(name, options, tasks, folder / results, reports)
+    return Definition(name, options, tasks, folder / content.output.folder, content.output.reports)
 
 
-def _table(content: Mapping[str, Any], key: str) -> dict[str, Any]:
-    table = content.get(key, {})
-    if not isinstance(table, Mapping):
-        raise ValidationError(f"{key} is {table!r}; expected a table, [{key}]")
-    return dict(table)
-
-
-def _refuse_unknown(what: str, names: Collection[str], known: Collection[str]) -> None:
-    unknown = sorted(set(names) - set(known))
-    if unknown:
-        raise ValidationError(
-            f"unknown {what}: {', '.join(unknown)}; expected some of "
-            f"{choices(sorted(known), *unknown)}"
-        )
-
-
-def _run_laws(folder: Path, laws: Any) -> None:
-    """Run the files of laws, so that their laws are known by their kinds."""
-    from dahl_ident.elements.law_files import load_laws
-
-    files = [laws] if isinstance(laws, str) else laws
-    if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-        raise ValidationError(
-            f"laws is {laws!r}; expected the path of a Python file, or a list of paths"
-        )
-    for file in files:
-        load_laws(folder / file)
-
-
-def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
+def _model(entries: list[Any]) -> tuple[list[Any], Collection[str], dict[str, str]]:
     """Return the model as plain data, the names of its parameters, and digests of its law files."""
     from dahl_ident.elements.element import describe_model, model_from_description
     from dahl_ident.elements.law_files import user_laws
     from dahl_ident.elements.law_module import file_of
 
-    if (
-        not isinstance(entries, list)
-        or not entries
-        or not all(isinstance(entry, Mapping) for entry in entries)
-    ):
-        raise ValidationError('there is no model; give [[model]] tables, such as kind = "dahl"')
     model = model_from_description(entries)
     files = {file for law in user_laws(model.elements) if (file := file_of(law)) is not None}
     digests = {Path(file.path).name: file.digest for file in sorted(files)}
@@ -219,13 +207,11 @@ def _check_options(options: Mapping[str, Any]) -> None:
         functions["posterior"] = posterior
     for table, function in functions.items():
         known = set(inspect.signature(function).parameters) - _SET_BY_CAMPAIGN
-        _refuse_unknown(f"options in [{table}]", options[table], known)
-    try:
-        json.dumps(options)
-    except TypeError as exc:
-        raise ValidationError(
-            f"an option is a date or a time; expected a number or a text in quotes ({exc})"
-        ) from exc
+        if unknown := sorted(options[table].keys() - known):
+            raise ValidationError(
+                f"unknown options in [{table}]: {', '.join(unknown)}; expected some of "
+                f"{choices(sorted(known), *unknown)}"
+            )
 
 
 def _check_names(tasks: Sequence[Task], parameters: Collection[str]) -> None:
@@ -245,12 +231,9 @@ def _check_names(tasks: Sequence[Task], parameters: Collection[str]) -> None:
             )
 
 
-def _tasks(folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]:
-    pattern = files.get("pattern")
-    if not isinstance(pattern, str):
-        raise ValidationError("[files] has no pattern; give one, such as 'data/{device}.csv'")
-    paths = _matches(folder, pattern)
-    table = _covariates(folder, files.get("covariates"))
+def _tasks(folder: Path, files: _Files, per: str) -> tuple[Task, ...]:
+    paths = _matches(folder, files.pattern)
+    table = _covariates(folder, files.covariates)
     runs: dict[tuple[str, str], Task] = {}
     for path, fields in paths:
         device = fields.pop("device")
@@ -319,13 +302,11 @@ def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
 
 
 def _covariates(
-    folder: Path, table: Any
+    folder: Path, table: str | None
 ) -> dict[tuple[str, str | None], dict[str, float | str]] | None:
     """Return the rows of the table by device and run; None without a table."""
     if table is None:
         return None
-    if not isinstance(table, str):
-        raise ValidationError(f"[files] covariates is {table!r}; expected the path of a table")
     path = folder / table
     try:
         with regular(path).open(encoding="utf-8-sig", newline="") as file:
