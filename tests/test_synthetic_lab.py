@@ -108,19 +108,27 @@ def description(**changes):
     return EXPERIMENTS[0].to_dict() | changes
 
 
+@pytest.mark.versions
 @pytest.mark.parametrize(
     ("data", "message"),
     [
         ({"plant": []}, "the experiment has no excitation; expected plant, excitation"),
-        (description(sensor=1), "the experiment has the unknown sensor; expected plant"),
+        (description(sensor=1), "the experiment: unknown entry 'sensor'; expected plant"),
         (description(excitation={"levels": [1.0]}), "the excitation has the kind None"),
         (
             description(excitation={"kind": "stepped_sine", "level": 1.0}),
-            "excitation has the unknown level and no levels; expected levels, freq",
+            "the excitation: unknown entry 'level'; expected levels, .*did you mean 'levels'",
         ),
-        (description(acquisition={"force": {"noise": 1.0}}), "acquisition.force has the unknown"),
+        (
+            description(acquisition={"force": {"noise": 1.0}}),
+            "acquisition.force: unknown entry 'noise'",
+        ),
+        (
+            description(acquisition={"force": {"noise_std": -1.0}}),
+            "acquisition.force: noise_std is -1.0; expected numbers >= 0",
+        ),
         (description(acquisition=3), "acquisition is 3; expected a table of named values"),
-        (description(table={"std": 0.1}), "table has the unknown std; expected displacement_std"),
+        (description(table={"std": 0.1}), "table: unknown entry 'std'; expected displacement_std"),
     ],
 )
 def test_a_bad_description_names_the_key(data, message):
@@ -422,9 +430,11 @@ def test_a_record_lasts_as_long_as_its_excitation(excitation):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"plant": True}, "the model is True; expected a list of elements"),
-        ({"plant": [None]}, "the element is None; expected its kind and values by name"),
-        ({"excitation": "sine"}, "the excitation is 'sine'; expected a table of named values"),
+        ({"plant": True}, "plant is True; expected a list"),
+        ({"plant": [None]}, r"plant\[0\] is None; expected a table of named values"),
+        ({"excitation": "sine"}, "excitation is 'sine'; expected a table of named values"),
+        ({"table": {"harmonics": [1, 1.5]}}, r"table.harmonics\[1\] is 1.5; expected a whole"),
+        ({"motion": "translatoin"}, "expected one of .*; did you mean 'translation'"),
         ({"excitation": {"kind": []}}, r"the excitation has the kind \[\]; expected one of"),
     ],
 )

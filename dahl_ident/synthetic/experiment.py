@@ -9,18 +9,19 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import tomli_w
 
 from dahl_ident.data.columns import one_of
+from dahl_ident.data.entries import checked
 from dahl_ident.data.storage import read_text
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model, describe_model, model_from_description
-from dahl_ident.errors import DahlIdentError, DataError, ValidationError
-from dahl_ident.synthetic.acquisition import Acquisition, Channel, Table
+from dahl_ident.errors import DahlIdentError, DataError, ValidationError, choices
+from dahl_ident.synthetic.acquisition import Acquisition, Table
 from dahl_ident.synthetic.excitation import (
     AmplitudeRamp,
     Excitation,
@@ -29,12 +30,22 @@ from dahl_ident.synthetic.excitation import (
 )
 from dahl_ident.units import Motion
 
-_T = TypeVar("_T")
 _EXCITATIONS: dict[str, type[Excitation]] = {
     "stepped_sine": SteppedSine,
     "frequency_sweep": FrequencySweep,
     "amplitude_ramp": AmplitudeRamp,
 }
+
+
+@dataclass(frozen=True)
+class _Description:
+    """An experiment as data."""
+
+    plant: list[dict[str, Any]]
+    excitation: dict[str, Any]
+    acquisition: Acquisition = field(default_factory=Acquisition)
+    table: Table | None = None
+    motion: Motion = "translation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,29 +146,18 @@ class Experiment:
         Raises
         ------
         DataError
-            If a key is unknown or missing.
+            If a key is unknown or missing, or a value is of another type.
         """
-        values = _checked(description, cls, "the experiment")
-        excitation = values["excitation"]
-        if not isinstance(excitation, Mapping):
-            raise DataError(f"the excitation is {excitation!r}; expected a table of named values")
-        excitation = dict(excitation)
-        kind = excitation.pop("kind", None)
+        known = checked(_Description, description, "the experiment")
+        kind = known.excitation.pop("kind", None)
         if kind not in [*_EXCITATIONS]:
             raise DataError(
-                f"the excitation has the kind {kind!r}; expected one of {', '.join(_EXCITATIONS)}"
+                f"the excitation has the kind {kind!r}; expected one of "
+                f"{choices(_EXCITATIONS, kind)}"
             )
-        acquisition = _checked(values.get("acquisition", {}), Acquisition, "acquisition")
-        for name in acquisition.keys() & {"displacement", "force"}:
-            acquisition[name] = _built(Channel, acquisition[name], f"acquisition.{name}")
-        table = values.get("table")
-        return cls(
-            plant=model_from_description(values["plant"]),
-            excitation=_built(_EXCITATIONS[kind], excitation, "excitation"),
-            acquisition=Acquisition(**acquisition),
-            table=None if table is None else _built(Table, table, "table"),
-            motion=values.get("motion", "translation"),
-        )
+        plant = model_from_description(known.plant)
+        excitation = checked(_EXCITATIONS[kind], known.excitation, "the excitation")
+        return cls(**{**vars(known), "plant": plant, "excitation": excitation})
 
     def to_json(self) -> str:
         """Return the description as JSON."""
@@ -225,25 +225,6 @@ def _parsed(loads: Callable[[str], Any], text: str, form: str) -> Any:
         return loads(text)
     except ValueError as exc:
         raise DataError(f"the experiment is not {form}: {exc}") from exc
-
-
-def _built(cls: type[_T], entries: Mapping[str, Any], where: str) -> _T:
-    """Return the dataclass described by plain data."""
-    return cls(**_checked(entries, cls, where))
-
-
-def _checked(entries: Any, cls: type[Any], where: str) -> dict[str, Any]:
-    """Return plain data as arguments of a dataclass; refuse unknown or missing keys."""
-    if not isinstance(entries, Mapping):
-        raise DataError(f"{where} is {entries!r}; expected a table of named values")
-    required = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}
-    unknown = [key for key in entries if key not in required]
-    missing = [key for key in required if required[key] and key not in entries]
-    if unknown or missing:
-        faults = [f"the unknown {', '.join(unknown)}"] if unknown else []
-        faults += [f"no {', '.join(missing)}"] if missing else []
-        raise DataError(f"{where} has {' and '.join(faults)}; expected {', '.join(required)}")
-    return dict(entries)
 
 
 def _plain(value: Any) -> Any:
