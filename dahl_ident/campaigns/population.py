@@ -38,7 +38,6 @@ USABLE = ("trusted", "approximate")
 """Statuses whose numbers and uncertainties can be used."""
 _NODES = 31  # grid points in tau and in omega; twice as many change no interval by 1 %
 _GRID_DROP = 14.0  # drop of the log-likelihood, a factor of a million, at which the grid ends
-_LARGEST_TAU = 20.0  # in REML, in standard deviations of the estimates
 _FALSE_ALARMS = 0.01  # probability that any device is called outlying if none is
 # Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations
 EWMA_WEIGHT, EWMA_WIDTH = 0.2, 2.86
@@ -505,19 +504,17 @@ class _Averages(NamedTuple):
 def _reml(data: _Fits) -> tuple[float, float]:
     """Return the restricted maximum-likelihood estimates of tau and omega, each 0 or more."""
     spread = float(np.sqrt(np.var(data.y) + data.u2.min()))
+    unknown = 2 if len(data.y) > data.devices else 1
+
+    def scatters(x: FloatArray) -> FloatArray:
+        return np.pad(np.abs(x) * spread, (0, 2 - unknown))  # even: zero is no edge
 
     def objective(x: FloatArray) -> float:
-        return -data.solve(*np.abs(x) * spread).log_likelihood  # even: zero is no edge
+        return -data.solve(*scatters(x).tolist()).log_likelihood
 
-    if len(data.y) == data.devices:
-        best = optimize.minimize_scalar(
-            lambda t: objective(np.array([t, 0.0])), bounds=(0.0, _LARGEST_TAU), method="bounded"
-        )
-        return float(best.x) * spread, 0.0
-    starts = [np.array([a, b]) for a in (0.7, 0.05) for b in (0.7, 0.05)]
-    optima = [optimize.minimize(objective, s, method="Nelder-Mead") for s in starts]
-    tau, omega = np.abs(min(optima, key=lambda r: float(r.fun)).x) * spread
-    return float(tau), float(omega)
+    best = optimize.minimize(objective, np.full(unknown, 0.5), method="Nelder-Mead")
+    tau, omega = scatters(best.x).tolist()
+    return tau, omega
 
 
 def _nodes(data: _Fits, mode: tuple[float, float], axis: int) -> FloatArray:
