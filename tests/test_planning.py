@@ -1,7 +1,6 @@
 """Plans of measurements: optimal, as good as they say, and within every limit."""
 
 import itertools
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -434,8 +433,7 @@ class TestPlan:
         assert f"{len(plan.steps)} levels in" in str(plan)
         assert plan.to_frame()["seconds"].sum() == pytest.approx(plan.seconds)
         assert list(plan.budget().index) == ["f_max", "sigma"]
-        saved = json.loads(plan.save(tmp_path / "plan.json").read_text())
-        assert saved["expected"]["f_max"]["before"] is None  # nothing is known before
+        assert plan.to_dict()["expected"]["f_max"]["before"] == np.inf  # nothing is known before
         axis = plan.plot()
         assert len(axis.lines) == 2
 
@@ -447,7 +445,7 @@ class TestPlan:
             ({"limits": KNEE}, "without a target uncertainty the time is needed"),
             ({"limits": {**KNEE, "time": 0.5}}, "the quickest level takes"),
             ({"limits": {**KNEE, "time": 9, "force": 1e-9}}, "force excludes"),
-            ({"noise": None}, "the noise is unknown before any data"),
+            ({"noise": None}, "the noise of a cycle is unknown; give noise="),
             ({"noise": {"relativ": 1}}, "noise has relativ; expected relative"),
             ({"target": {"mass": 0.1}}, "target names 'mass'; expected a product of powers, such"),
             ({"target": {"f_max+1": 0.1}}, "expected a parameter, or a product of powers"),

@@ -166,7 +166,7 @@ class TestPlan:
         with pytest.raises(ValidationError, match="ranges are given with a fit of records"):
             di.plan(fit, limits=BENCH, candidates="trapezoid", sample_rate=RATE, target="f_max",
                     ranges=NEAR)  # fmt: skip
-        with pytest.raises(ValidationError, match="the noise of a sample, not of one cycle of a"):
+        with pytest.raises(ValidationError, match="the noise of a cycle is unknown"):
             di.plan(fit, limits=BENCH, target={"f_max": 0.01})
         target = {"f_max": 0.003}
         plan = di.plan(fit, limits=BENCH, target=target, candidates="trapezoid", sample_rate=RATE)

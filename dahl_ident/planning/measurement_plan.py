@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number
-from dahl_ident.data.storage import place_of, plain_data, write_whole
+from dahl_ident.data.storage import place_of, write_whole
 from dahl_ident.diagnostics.formatting import listed, table
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
@@ -230,25 +229,6 @@ class Plan:
                     "with a longer change_over"
                 )
             position = start
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the plan as JSON.
-
-        Parameters
-        ----------
-        path : path
-            Ending in ``.json``.
-        overwrite : bool, default False
-            Replace an existing file.
-
-        Returns
-        -------
-        Path
-        """
-        place = place_of(path, "a plan", (".json",))
-        plain = plain_data(self.to_dict(), not_finite=lambda _: None)
-        write_whole(place, json.dumps(plain, indent=2).encode(), overwrite=overwrite)
-        return place
 
     def curves(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Return times and the uncertainty by plans of these times, for each quantity.

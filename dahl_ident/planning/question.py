@@ -116,14 +116,9 @@ def noise_of_cycle(noise: float | Mapping[str, float] | None, knowledge: Knowled
     """Return the noise of one cycle, as given or from the earlier data."""
     if noise is None:
         if knowledge.row_noise is None:
-            reason, other = "the noise is unknown before any data", ""
-            if knowledge.sample_noise is not None:
-                reason = "a fit of records has the noise of a sample, not of one cycle of a sine"
-                trapezoid = argument("candidates", "trapezoid", option="motion")
-                other = f"; or plan motions in time ({trapezoid}), of which it is known"
             raise ValidationError(
-                f"plan: {reason}; give {argument('noise', 0.01)} (of ln gain and phase in one "
-                f"cycle), or its parts: relative, force in N, displacement in m{other}"
+                f"plan: the noise of a cycle is unknown; give {argument('noise', 0.01)} (of ln "
+                "gain and phase), or its parts: relative, force in N, displacement in m"
             )
         return CycleNoise(knowledge.row_noise * float(np.sqrt(knowledge.row_cycles)))
     if not isinstance(noise, Mapping):
