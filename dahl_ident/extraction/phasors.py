@@ -32,7 +32,6 @@ from dahl_ident.extraction.segment_quality import (
     alias_error,
     asymmetry,
     clipped_share,
-    crest_samples,
     distortion,
     fundamental_share,
     has_unmeasured_aliases,
@@ -350,9 +349,7 @@ class Phasors:
         fit, steps = self.fit, self.steps
         shares = fundamental_share(fit, fit.segment)
         amplitudes = np.abs(fit.phasors(1))
-        crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase)
-        longest = (crest, np.inf)
-        clipped = list(map(clipped_share, self.recorded, steps, longest))
+        clipped = list(map(clipped_share, self.recorded, steps))
         with np.errstate(divide="ignore"):
             in_steps = amplitudes / steps
         return {
