@@ -58,7 +58,6 @@ class Knowledge:
     # standard deviation of ln gain and of phase of a row of earlier data
     row_noise: float | None = None
     row_cycles: float = 1.0  # cycles averaged in such a row, if the data state it
-    problem: TableProblem | None = None  # of the earlier data
     scatter: float = 0.0  # standard deviation of ln gain and phase between runs in the earlier data
     between: FloatArray | None = None  # (P,) variances of theta between runs, if there are any
     errors: ErrorModel | None = None  # of an earlier fit
@@ -218,7 +217,6 @@ def _of_table(
         problem.data.motion,
         noise,
         cycles,
-        wider,
         0.0 if errors is None else errors.rms(RUNS),
         between,
         errors,

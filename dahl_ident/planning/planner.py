@@ -215,7 +215,9 @@ def _of_motions(question: PlanRequest) -> Plan:
 
     This information depends on the number of repeats, because a record's unknowns take about one.
     """
-    lasting = Search(question, candidates_within(question, question.limits)).best().seconds
+    design = Search(question, candidates_within(question, question.limits)).best()
+    lasting = design.seconds - question.costs["change_over"] * len(design.levels)
+    lasting /= len(design.levels)
     search = Search(question, candidates_within(question, question.limits, lasting=lasting))
     return _plan(search, search.best())
 

@@ -13,7 +13,6 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime, Candidates
 from dahl_ident.planning.design import Coverage, Design, Exchange
 from dahl_ident.planning.forecast import Expected, Forecast
-from dahl_ident.planning.motion_information import RepeatSums
 from dahl_ident.planning.question import PlanRequest, limit
 
 _MOST_RUNS = 8  # to average scatter between runs: a ninth run would gain 6 %
@@ -22,7 +21,6 @@ _LONGER = 4.0  # factor from one time to the next until a target is reached
 _HELPS = 0.1  # more time is useless below this fraction of the gain by the square root of time
 _CLOSE = 0.985  # fraction of the plan's time in which the target is not reached any more
 _APART = 2.0  # span of levels, in ranges that a fit takes as one amplitude: these are not exact
-_FILLED = 0.999  # fraction of the target that corrected repeats aim at
 
 
 class Search:
@@ -53,7 +51,7 @@ class Search:
                 f"{'level' if q.recorded is None else 'motion'} takes {least:.3g} "
                 "s to change over, settle and measure; give more time"
             )
-        return design if q.recorded is None else self._exactly(design)
+        return design
 
     def solve(self, time: float, start: Sequence[int] = ()) -> Design | None:
         """Return the best levels and runs for a time; None where it is too short."""
@@ -74,7 +72,7 @@ class Search:
         """Requirements on levels so that a fit to them alone can reveal a wrong model."""
         known, candidates = self.question.knowledge, self.forecast.candidates
         amplitude = np.log(np.median(candidates.amplitude, axis=0))
-        if known.problem is not None or known.sample_noise is not None or candidates.motions:
+        if known.row_noise is not None or known.sample_noise is not None or candidates.motions:
             return Coverage(1, 0.0, amplitude)
         fitted = len(known.names) - len(known.assumed)
         span = _APART * LEAST_RANGE if np.ptp(amplitude) >= _APART * LEAST_RANGE else 0.0
@@ -122,28 +120,6 @@ class Search:
             else:
                 short = time
         return design
-
-    def _exactly(self, design: Design) -> Design:
-        """Return the repeats that reach the targets by the information of the whole records.
-
-        The search gives every repeat of a motion the same information. The first repeats give less,
-        because they also have to determine the state at the start, the offset and the drift.
-        """
-        q, candidates, levels = self.question, self.forecast.candidates, design.levels
-        assert q.recorded is not None
-        sums = [RepeatSums.of(q.knowledge, candidates.motions[k], q.recorded) for k in levels]
-        cycles = design.cycles
-        while True:
-            rows = candidates.rows.copy()
-            for k, motion_sums, repeats in zip(levels.tolist(), sums, cycles.tolist(), strict=True):
-                rows[:, k] = motion_sums.rows(int(repeats)) * q.knowledge.units
-            self.forecast = replace(self.forecast, candidates=replace(candidates, rows=rows))
-            design = replace(design, cycles=cycles, seconds=self.bench.seconds(levels, cycles))
-            design = replace(design, ratio=self.ratio(design))
-            cycles = np.maximum(np.ceil(cycles * (design.ratio / _FILLED) ** 2), cycles + 1.0)
-            possible = self.bench.seconds(levels, cycles) <= min(q.limits.time, LONGEST)
-            if not (q.has_numbers and possible) or design.ratio <= 1.0:
-                return design
 
     def expected_after(self, time: float) -> dict[str, Expected]:
         """Return what the best plan of a time determines; empty if it is too short."""
