@@ -203,12 +203,9 @@ class Exchange:
         self._criterion, self._bench = criterion, bench
         self._coverage = coverage or Coverage(1, 0.0, np.zeros(len(bench.frequency_hz)))
 
-    def best(self, time: float, start: Sequence[int] = ()) -> Design | None:
+    def best(self, time: float) -> Design | None:
         """Return the best levels for one run of `time` s; None if no level can be measured."""
-        chosen, value, fewest = list(start), -np.inf, self._coverage.fewest
-        if chosen:
-            value = float(self._values([chosen], time)[0])
-            chosen = chosen if np.isfinite(value) else []
+        chosen, value, fewest = list[int](), -np.inf, self._coverage.fewest
         improves = True
         while improves:
             added = self._promising(chosen, time) if len(chosen) < _MOST_LEVELS else []

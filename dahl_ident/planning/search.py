@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -53,18 +52,16 @@ class Search:
             )
         return design
 
-    def solve(self, time: float, start: Sequence[int] = ()) -> Design | None:
+    def solve(self, time: float) -> Design | None:
         """Return the best levels and runs for a time; None where it is too short."""
         q, best = self.question, None
         most = _MOST_RUNS if q.scatter > 0.0 or self.forecast.between is not None else 1
         for runs in (q.runs,) if q.runs else range(1, most + 1):
             criterion = replace(self._criterion, runs=runs)
-            search = Exchange(criterion, self.bench, self._coverage)
-            design = search.best(time / runs, start)
+            design = Exchange(criterion, self.bench, self._coverage).best(time / runs)
             if design is None or (best is not None and design.value <= best.value):
                 break
             best = replace(design, ratio=self.ratio(design))
-            start = design.levels.tolist()
         return best
 
     @cached_property
@@ -107,14 +104,14 @@ class Search:
             if time >= most:
                 return design
             short, time, before = time, min(_LONGER * time, most), design
-            design = self.solve(time, () if before is None else before.levels.tolist())
+            design = self.solve(time)
             if before is not None and design is not None and design.ratio > 1.0:
                 by_time = 0.5 * np.log(design.seconds / before.seconds)
                 if np.log(before.ratio / design.ratio) < _HELPS * by_time:
                     return before
         while short < _CLOSE * design.seconds:
             time = float(np.sqrt(design.seconds * max(short, design.seconds / _LONGER)))
-            shorter = self.solve(time, design.levels.tolist())
+            shorter = self.solve(time)
             if shorter is not None and self.reached(shorter):
                 design = shorter
             else:
