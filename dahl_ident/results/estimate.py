@@ -199,7 +199,8 @@ def fit(
     if cause := problem.why_not_finite(optimum.residuals):
         raise FitError(cause)
     if throw and not result.success:
-        raise FitError(f"{result.goodness.cause} {result.message}".strip(), result)
+        cause = f"{result.goodness.sign}. " if result.goodness.sign else ""
+        raise FitError(f"{cause}{result.message}", result)
     return result
 
 
