@@ -383,8 +383,8 @@ def _minimum(
 ) -> WeightedEstimate:
     """Return the minimum that a Gauss-Newton search from theta reaches.
 
-    Each step computes the weights anew, which makes the steps a geometric series; they are
-    extrapolated to its limit. A step that does not lower the cost is repeated with more damping.
+    Each step computes the weights anew. A step that does not lower the cost is repeated with more
+    damping.
     """
     stated, basis = problem.widened(np.zeros(problem.data.n)), Basis.every(len(theta))
     loss, m = loss_named(optimum.loss, problem.residuals_per_row), problem.n_residuals
@@ -392,7 +392,6 @@ def _minimum(
         _, J = stated.residuals_and_jacobian(theta)
         basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
     damping, bounds = 0.0, problem.bounds()
-    last_change: FloatArray | None = None  # of the residuals; None after a step that is not plain
     for _ in range(_GAUSS_NEWTON_STEPS):
         variance, scale = _weights(stated, theta, loss)
         weighted = stated.widened(variance)
@@ -403,17 +402,12 @@ def _minimum(
         if not (np.isfinite(y).all() and np.isfinite(columns).all()):
             raise np.linalg.LinAlgError("no finite step from the estimate")
         step = _step(columns, y, theta, basis, bounds)
-        change = columns @ step
-        if np.linalg.norm(change) < _SETTLED:
+        if np.linalg.norm(columns @ step) < _SETTLED:
             break
-        factor = _extrapolation(change, last_change)
-        step = factor * step
-        last_change = change if factor == 1.0 else None
         mean_slope = 1.0 if loss is None else loss.mean_slope(squares_of(r[:m]))
         cost = _cost(r, m, loss, mean_slope)
         for _ in range(_STEP_TRIALS):
             if damping:
-                last_change = None
                 rows = np.diag(np.sqrt(damping) * np.linalg.norm(columns, axis=0))
                 damped = np.vstack([columns, rows]), np.append(y, np.zeros(len(rows)))
                 step = _step(*damped, theta, basis, bounds)
@@ -468,12 +462,6 @@ def _step(
         free[directions] = False
         to_bounds[directions] = (end_within - theta)[beyond] / matrix[beyond, directions]
     return np.asarray(step)
-
-
-def _extrapolation(moved: FloatArray, last: FloatArray | None) -> float:
-    """Return the factor that extends a step of a geometric series to the limit of the series."""
-    ratio = 0.0 if last is None else float(moved @ last) / max(float(last @ last), TINY)
-    return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
 
 
 @lru_cache(maxsize=64)  # used in every step of a search
