@@ -26,12 +26,11 @@ import numpy as np
 
 import dahl_ident as di
 from benchmarks.coverage import F_MAX, SIGMA, X_C
-from dahl_ident.arrays import FloatArray, IntArray
+from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Model
 from dahl_ident.fitting import solve_many
 from dahl_ident.planning import Plan
-from dahl_ident.planning.search import Search
 from dahl_ident.problem import ProblemBatch
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.synthetic.waveform import WaveformBuilder
@@ -291,8 +290,9 @@ def compare(scenario: Scenario, count: int, seed: int, whole: int = 0) -> Iterat
     With `count` tables and `whole` experiments of each design.
     """
     first = scenario.plan(1e6, None, candidates=60)
-    bench = first.search.bench
-    levels = bench.order(_grid(first.search, scenario.levels))
+    bench, grid = first.search.bench, first.search.logarithmic_grid(1e6, scenario.levels)
+    assert grid is not None
+    levels = grid.levels
     time = bench.seconds(levels, np.full(len(levels), float(CYCLES)))
     options = first.search.forecast.candidates
     even = Design(
@@ -316,22 +316,6 @@ def compare(scenario: Scenario, count: int, seed: int, whole: int = 0) -> Iterat
                 got[name], base[name], run.get(name, np.nan), base_whole.get(name, np.nan),
                 whole,
             )  # fmt: skip
-
-
-def _grid(search: Search, count: int) -> IntArray:
-    """Return an even logarithmic grid of levels; of several frequencies, a third at three."""
-    c = search.forecast.candidates
-    groups, frequencies = [np.arange(c.count)], np.unique(c.frequency_hz)
-    rate_free = search.question.knowledge.model.rate_independent
-    if len(frequencies) > 2 and not (rate_free and c.controlled == "displacement"):
-        three = frequencies[[0, len(frequencies) // 2, -1]]
-        groups = [np.flatnonzero(c.frequency_hz == f) for f in three]
-    chosen: list[int] = []
-    for group in groups:
-        level = np.log(c.level[group])
-        places = np.linspace(level.min(), level.max(), max(count // len(groups), 2))
-        chosen += [int(group[np.argmin(np.abs(level - p))]) for p in places]
-    return np.unique(chosen)
 
 
 # Sequences
@@ -387,6 +371,7 @@ SERIES = {
     "validation": [f"ensaio.vali.{i}.mat" for i in range(1, 10)],
 }
 CHOSEN = 4  # levels of a series
+AIMS = {"all parameters": None, "response": "response"}
 
 
 @dataclass(frozen=True)
@@ -406,6 +391,7 @@ class Choices:
     """
 
     series: str
+    aim: str
     levels: int
     evenly: float
     typical: float
@@ -427,17 +413,18 @@ def damper(folder: Path) -> Iterator[Choices]:
         fours = list(itertools.combinations(numbers, CHOSEN))
         every = {four: _predicted(levels, four, model) for four in fours}
         even = tuple(np.linspace(0, len(levels) - 1, CHOSEN).round().astype(int).tolist())
-        found, better = [], []
-        for pair in itertools.combinations(numbers, 2):
-            found.append(every[_chosen(levels, pair, model)])
-            ways = [every[four][0] for four in fours if set(pair) <= set(four)]
-            better.append(np.mean(np.array(ways) >= found[-1][0]))
-        inside, count = (sum(one[i] for one in found) for i in (1, 2))
-        yield Choices(
-            series, len(levels), every[even][0],
-            float(np.median([error for error, _, _ in every.values()])),
-            np.array([error for error, _, _ in found]), float(np.mean(better)), inside / count,
-        )  # fmt: skip
+        for aim, target in AIMS.items():
+            found, better = [], []
+            for pair in itertools.combinations(numbers, 2):
+                found.append(every[_chosen(levels, pair, model, target)])
+                ways = [every[four][0] for four in fours if set(pair) <= set(four)]
+                better.append(np.mean(np.array(ways) >= found[-1][0]))
+            inside, count = (sum(one[i] for one in found) for i in (1, 2))
+            yield Choices(
+                series, aim, len(levels), every[even][0],
+                float(np.median([error for error, _, _ in every.values()])),
+                np.array([error for error, _, _ in found]), float(np.mean(better)), inside / count,
+            )  # fmt: skip
 
 
 def _level(path: Path) -> FrequencyResponse:
@@ -464,35 +451,47 @@ def damper_table(choices: Sequence[Choices]) -> str:
         "Required: smaller than of four evenly spaced levels (else marked (!)), and inside the "
         "95.45 % bands.",
         "",
-        "| series | plans | evenly spaced | all choices of four | plan better than "
+        "| series | plan for | plans | evenly spaced | all choices of four | plan better than "
         "evenly | than other additions to the pair | inside the bands |",
-        "|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|",
     ]
-    rows = [
-        (
-            float(np.median(c.planned)), c.evenly, c.typical,
-            float(np.mean(c.planned < c.evenly)), c.better, c.inside,
-        )
-        for c in choices
-    ]  # fmt: skip
-    lines += [_damper_row(c.series, *row) for c, row in zip(choices, rows, strict=True)]
-    lines.append(_damper_row("mean", *(float(np.mean(one)) for one in zip(*rows, strict=True))))
+    for aim in AIMS:
+        own = [c for c in choices if c.aim == aim]
+        for c in own:
+            median = float(np.median(c.planned))
+            won = float(np.mean(c.planned < c.evenly))
+            lines.append(
+                _damper_row(c.series, aim, median, c.evenly, c.typical, won, c.better, c.inside)
+            )
+        means = [
+            float(np.mean(one))
+            for one in zip(
+                *(
+                    (
+                        float(np.median(c.planned)), c.evenly, c.typical,
+                        float(np.mean(c.planned < c.evenly)), c.better, c.inside,
+                    )
+                    for c in own
+                ), strict=True,
+            )
+        ]  # fmt: skip
+        lines.append(_damper_row("mean", aim, *means))
     return "\n".join(lines)
 
 
 def _damper_row(
-    series: str, plans: float, evenly: float, typical: float, won: float, better: float,
+    series: str, aim: str, plans: float, evenly: float, typical: float, won: float, better: float,
     inside: float,
 ) -> str:  # fmt: skip
     missed = "" if plans < evenly else " (!)"
     return (
-        f"| {series} | {plans:.2%}{missed} | {evenly:.2%} | {typical:.2%} | {won:.0%} "
+        f"| {series} | {aim} | {plans:.2%}{missed} | {evenly:.2%} | {typical:.2%} | {won:.0%} "
         f"| {better:.0%} | {inside:.0%} |"
     )
 
 
 def _chosen(
-    levels: Sequence[FrequencyResponse], pair: tuple[int, int], model: Model
+    levels: Sequence[FrequencyResponse], pair: tuple[int, int], model: Model, target: str | None
 ) -> tuple[int, ...]:
     chosen = list(pair)
     while len(chosen) < CHOSEN:
@@ -501,7 +500,7 @@ def _chosen(
         options = [(_amplitude(levels[i]), float(levels[i].frequency_hz[0])) for i in rest]
         plan = di.plan(
             fit, limits={"frequency_hz": (0.1, 3.0), "time": 6.0}, candidates=options, draws=30,
-            ranges=KNOWN, settled=1.0,
+            target=target, ranges=KNOWN, settled=1.0,
         )  # fmt: skip
         (best,) = plan.steps  # no time for two
         chosen.append(rest[int(np.argmin([abs(A - best.level) for A, _ in options]))])
@@ -602,25 +601,25 @@ def motions_table(count: int) -> str:
         "the first sample and an offset, fitted in time. Required: agreement within "
         f"{100 * CLOSE:g} %.",
         "",
-        "| model | plan for | time [s] | parameter | predicted | achieved | agreement |",
-        "|---|---|---|---|---|---|---|",
+        "| model | motions | plan for | time [s] | parameter | predicted | achieved | agreement |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     cases: list[tuple[str, Model, dict[str, float], Any, float]] = [
         ("Dahl", LINEAR, truth, near, 30.0),
         ("Dahl, spring, damper", LINEAR + di.Spring() + di.Damper(), both, wide, 60.0),
     ]
     for name, model, values, ranges, time in cases:
-        for target in (None, "sigma"):
+        for kind, target in itertools.product(("trapezoid", "multisine"), (None, "sigma")):
             plan = di.plan(
                 model, ranges=ranges, limits={**bench, "time": time}, target=target,
-                noise={"force": noise}, sample_rate=rate, candidates="trapezoid",
+                noise={"force": noise}, sample_rate=rate, candidates=kind,
             )  # fmt: skip
             got = achieved_by_records(plan, model, values, rate, noise, count, seed=0)
             for p in values if target is None else (target,):
                 told = plan.expected[p].after
                 apart = "" if abs(told / got[p] - 1.0) <= CLOSE else " (!)"
                 lines.append(
-                    f"| {name} | {target or 'all'} | {plan.seconds:.0f} | {p} "
+                    f"| {name} | {kind} | {target or 'all'} | {plan.seconds:.0f} | {p} "
                     f"| {told:.2e} | {got[p]:.2e} | {told / got[p]:.2f}{apart} |"
                 )
     return "\n".join(lines)

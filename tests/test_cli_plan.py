@@ -1,6 +1,7 @@
 """``dahl-ident plan``: the same numbers as in Python, and files that can be used."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -89,3 +90,17 @@ def test_a_target_out_of_reach_ends_with_3(run):
 )
 def test_bad_input_says_what_was_expected(run, options, message):
     assert message in run.refused("plan", *BENCH, *options)
+
+
+def test_time_to_spare_is_for_repeats(run):
+    outcome = run("plan", *BENCH, *RANGES, "--alpha", "1", "--target", "f_max=0.01", "--time", "1h")
+    first = outcome.out.splitlines()[0]
+    seconds = float(first.split()[3])
+    assert "meets the target" in first
+    left = re.search(r"(\d+) s are left; the whole time would give f_max (\S+) %", outcome.out)
+    assert float(left[1]) == pytest.approx(3600.0 - seconds, rel=1e-3)
+    assert float(left[2]) < 0.2, "an hour instead of seconds"
+    assert "Repeat the plan in 5 runs, each a new mounting" in outcome.out
+    short = run("plan", *BENCH, *RANGES, "--alpha", "1", "--target", "f_max=0.01", "--time",
+                f"{1.2 * seconds}s")  # fmt: skip
+    assert "are left" not in short.out

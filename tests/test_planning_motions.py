@@ -1,6 +1,7 @@
 """Plans of motions in time: as good as they say, the best of all, and within every limit."""
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import dahl_ident as di
 from benchmarks import planning
 from dahl_ident.errors import ValidationError
-from dahl_ident.planning import Trapezoid
+from dahl_ident.planning import Multisine, Trapezoid
 from dahl_ident.problem import RecordProblem
 
 TRUTH = {"f_max": 0.1, "sigma": 30.0}
@@ -17,11 +18,12 @@ NEAR = {"f_max": (0.0999, 0.1001), "sigma": (29.97, 30.03)}
 LINEAR = di.Model(di.Dahl(alpha=1.0))
 BENCH = {"displacement": (1e-4, 3e-2), "speed": 0.05, "acceleration": 1.0, "frequency_hz": 5.0}
 NOISE, RATE = 0.005, 100.0
-FEW = (
+Motion = Trapezoid | Multisine
+FEW: tuple[Motion, ...] = (
     Trapezoid(0.006, 0.02, 1.0),
     Trapezoid(0.02, 0.02, 1.0),
     Trapezoid(0.02, 0.05, 1.0, dwell=0.2),
-    Trapezoid(0.01, 0.03, 0.3),
+    Multisine(0.5, 2.0, 0.005),
 )
 
 
@@ -49,7 +51,7 @@ def _covariance(motions):
 
 
 class TestMotions:
-    @pytest.mark.parametrize("motion", [*FEW, Trapezoid(0.001, 0.2, 0.1)])
+    @pytest.mark.parametrize("motion", [*FEW, Trapezoid(0.001, 0.2, 0.1), Multisine(0.3, 3.1, 1.0)])
     def test_a_period_starts_and_ends_at_rest_within_its_peaks(self, motion):
         time = np.linspace(0.0, 2.0 * motion.period, 200_001)
         x = motion.displacement(time)
@@ -59,6 +61,13 @@ class TestMotions:
         assert found == pytest.approx(motion.peaks, rel=2e-3)
         assert x[0] == pytest.approx(x[100_000], abs=1e-9 * found[0])
         assert abs(v[0]) < 1e-3 * found[1]
+
+    def test_a_multisine_has_equal_lines_in_its_band(self):
+        motion = Multisine(0.5, 3.0, 2.0)
+        lines = np.abs(np.fft.rfft(motion.displacement(np.arange(64) / 32.0))) / 32.0
+        assert lines[1:7] == pytest.approx(np.full(6, lines[1]), rel=1e-9)
+        assert lines[7:] == pytest.approx(0.0, abs=1e-12)
+        assert motion.parameters["rms"] == pytest.approx(lines[1] * np.sqrt(3.0))
 
 
 class TestPlan:
@@ -104,10 +113,11 @@ class TestPlan:
         assert plan.seconds <= time
         assert own <= best + 0.03  # 1.5 % of a standard uncertainty
 
-    def test_a_target_is_reached_within_every_limit(self):
-        plan = _plan(
-            "trapezoid", {"force": 0.11, "speed": 0.03}, target={"f_max": 0.002, "sigma": 0.003}
-        )
+    @pytest.mark.parametrize(
+        "kind", ["trapezoid", pytest.param("multisine", marks=pytest.mark.long)]
+    )
+    def test_a_target_is_reached_within_every_limit(self, kind):
+        plan = _plan(kind, {"force": 0.11, "speed": 0.03}, target={"f_max": 0.002, "sigma": 0.003})
         assert plan.reached
         assert all(
             e.after <= u for e, u in zip(plan.expected.values(), (0.002, 0.003), strict=True)
@@ -115,9 +125,7 @@ class TestPlan:
         for step in plan.steps:
             size, speed, pull = step.motion.peaks
             assert (size <= 0.03, speed <= 0.0301, pull <= 1.001) == (True, True, True)
-        less = _plan(
-            "trapezoid", {"speed": 0.03, "time": 0.5 * plan.seconds}, target={"sigma": 0.003}
-        )
+        less = _plan(kind, {"speed": 0.03, "time": 0.5 * plan.seconds}, target={"sigma": 0.003})
         assert not less.reached
         assert "the limit of time prevents it" in str(less)
 
@@ -138,8 +146,8 @@ class TestPlan:
             force = law.force(x) + 2e-4 * rng.standard_normal(time.size)
             return di.Record(time, displacement=x, force=force)
 
-        small = measured(Trapezoid(0.002, 0.01, 0.1), 10.0)
         # nearly all of its uncertainty is the exponent's
+        small = measured(Trapezoid(0.002, 0.01, 0.1), 10.0)
         earlier, bench = di.fit(small, di.Dahl()), {**BENCH, "time": 20.0}
         plan = di.plan(earlier, limits=bench, candidates=FEW[:1], sample_rate=RATE, draws=6)
         (step,) = plan.steps
@@ -166,7 +174,7 @@ class TestPlan:
         with pytest.raises(ValidationError, match="ranges are given with a fit of records"):
             di.plan(fit, limits=BENCH, candidates="trapezoid", sample_rate=RATE, target="f_max",
                     ranges=NEAR)  # fmt: skip
-        with pytest.raises(ValidationError, match="the noise of a cycle is unknown"):
+        with pytest.raises(ValidationError, match="the noise of a sample, not of one cycle of a"):
             di.plan(fit, limits=BENCH, target={"f_max": 0.01})
         target = {"f_max": 0.003}
         plan = di.plan(fit, limits=BENCH, target=target, candidates="trapezoid", sample_rate=RATE)
@@ -191,10 +199,25 @@ class TestPlan:
 
     def test_the_curve_goes_through_the_plan(self):
         plan = _plan("trapezoid", {}, target={"f_max": 0.002, "sigma": 0.003})
-        for name, (times, planned) in plan.curves().items():
+        for name, (times, planned, _) in plan.curves().items():
             at = times.tolist().index(plan.seconds)
             assert planned[at] == plan.expected[name].after <= plan.target[name]
             assert (np.diff(planned[np.isfinite(planned)]) < 0.0).all()
+
+    def test_motions_of_two_kinds_stand_below_their_own_headings(self):
+        first, second = (_plan([one], {"time": 10.0}) for one in (FEW[1], FEW[3]))
+        text = str(replace(first, steps=first.steps + second.steps)).splitlines()
+        heading = next(line for line in text if "stroke [m]" in line)
+        lines = {kind: next(line for line in text if line[1:].split()[:1] == [kind])
+                 for kind in ("trapezoid", "multisine")}  # fmt: skip
+        for kind, column, value in (
+            ("trapezoid", "stroke [m]", "0.02"),
+            ("trapezoid", "peak [m]", "-"),
+            ("multisine", "peak [m]", "0.005"),
+            ("multisine", "dwell [s]", "-"),
+        ):
+            end = heading.index(column) + len(column)
+            assert lines[kind][:end].split()[-1] == value
 
     def test_the_move_to_the_start_stays_within_the_limits(self, tmp_path):
         limits = {"time": 30.0, "speed": 0.05, "acceleration": 0.5}
@@ -239,14 +262,21 @@ class TestPlan:
             ({"sample_rate": 0.5}, "expected at least 10 samples in a trapezoid's move"),
             ({"noise": 0.01}, "give only the standard deviation of a force sample"),
             ({"noise": None}, "the noise of the force is unknown"),
-            ({"candidates": "square"}, "a list of motions, or 'trapezoid'"),
+            ({"candidates": "square"}, "one of trapezoid, multisine"),
             ({"candidates": [FEW[0], (1e-3, 1.0)]}, "holds motions and others"),
             ({"candidates": FEW[0]}, "a list of motions"),
             ({"candidates": 20.0}, "expected a number, pairs"),
             ({"candidates": 20}, "leave it out for settled sines"),
             ({"runs": 2}, "runs is planned with settled sines only"),
+            ({"larger": di.Dahl()}, "larger is planned with settled sines only"),
+            ({"target": "response"}, "'response' is planned with settled sines only"),
             ({"controlled": "force"}, "controlled='force' is planned with settled sines only"),
+            ({"suspects": {"alpha": 0.1}}, "suspects is planned with settled sines only"),
             ({"limits": {"speed": 0.1, "time": 9}}, r"limits\['acceleration'\] is missing"),
+            (
+                {"candidates": "multisine", "limits": {"time": 9}},
+                r"limits\['frequency_hz'\] is missing",
+            ),
             ({"limits": {**BENCH, "time": 9, "force": 1e-9}}, "force excludes"),
             ({"limits": {**BENCH, "time": 0.5}}, "the quickest motion takes"),
         ],
@@ -262,3 +292,5 @@ class TestPlan:
     def test_bad_motions_say_what_was_expected(self):
         with pytest.raises(ValidationError, match="stroke of a trapezoid"):
             Trapezoid(-1.0, 1.0, 1.0)
+        with pytest.raises(ValidationError, match="expected rising frequencies"):
+            Multisine(2.0, 1.0, 1.0)

@@ -66,8 +66,9 @@ class Bench:
     controlled: str = controlled_setting()
     steady: str | None = steady_setting(None)
     motion: str | None = setting(
-        "Plan motions in time, for a fit of records; without it, settled sines.",
-        one_of="trapezoid",
+        "Plan motions in time, for a fit of records: trapezoid or multisine; without it, settled "
+        "sines.",
+        one_of="trapezoid|multisine",
     )
     noise: str | None = setting(
         "Noise of one cycle: '1 %', or 'relative=0.01,force=1mN,displacement=0.1um'; of a "
@@ -96,11 +97,14 @@ class Aim:
     panel: ClassVar[str] = "Aim"
     target: list[str] | None = setting(
         "Relative standard uncertainty to be met in the least time, f_max=0.02 or "
-        "f_max/sigma=0.02; a name alone is given the least uncertainty within --time. Repeatable; "
-        "by default all parameters."
+        "f_max/sigma=0.02, or an expanded one, 'U(f_max)=0.04'; a name alone is given the least "
+        "uncertainty within --time. Repeatable; by default all parameters."
     )
     ranges: list[str] | None = setting(
         "Range of a parameter with 95 % probability, f_max=0.05:0.2N; repeatable."
+    )
+    suspects: list[str] | None = setting(
+        "Parameter that the model may need, and its target uncertainty, alpha=0.1; repeatable."
     )
 
     def keywords(self) -> dict[str, Any]:
@@ -113,9 +117,11 @@ class Aim:
                 "none"
             )
         ranges = dict(_pair("ranges", text) for text in self.ranges or [])
+        suspects = dict(_pair("suspects", text) for text in self.suspects or [])
         return {
             "target": uncertainties or [name for name, _, _ in targets] or None,
             "ranges": {name: ends(f"ranges of {name}", text) for name, text in ranges.items()},
+            "suspects": {name: number(name, t, "1") for name, t in suspects.items()} or None,
         }
 
 

@@ -37,7 +37,7 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.confidence_levels import checked_levels
-from dahl_ident.diagnostics.contributions import MODEL_ERROR, TESTS, satterthwaite
+from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS, satterthwaite
 from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
 from dahl_ident.diagnostics.error_sources import error_sources, log_points, parts
 from dahl_ident.diagnostics.estimate import relative_units
@@ -128,6 +128,8 @@ class Departures(NamedTuple):
     columns: FloatArray  # (K, 2, W): changes of ln gain and phase at each point, at unit variance
     # (Q + W, Q + W): on theta and the departures, by earlier data, priors and unit variances
     information: FloatArray
+    # whether its variance is assumed, because too few residuals distinguish it from noise
+    assumed: bool
 
 
 def departures(
@@ -137,9 +139,15 @@ def departures(
     omega: FloatArray,
     stiffness: ComplexArray,
 ) -> Departures | None:
-    """Return the model error of a fit at other points; None without any."""
+    """Return the model error of a fit at other points; None without any.
+
+    If there are too few residuals to distinguish it from noise, it is assumed equal to the noise.
+    """
     variances = zip(errors.sources, errors.variances.tolist(), strict=True)
     sized = {source.kind: size for source, size in variances if source.name == MODEL_ERROR}
+    assumed = not errors.distinguishes_noise
+    if assumed:
+        sized = {(False, ""): errors.rms(NOISE) ** 2}
     if not any(sized.values()):
         return None
     points, estimate = log_points(amplitude, omega), errors.estimate
@@ -163,7 +171,7 @@ def departures(
     sizes = [*state.variances[[*range(noises), *(noises + k for k in others)]], 1.0]
     K, Q, W = joint.at(np.array(sizes)).K, len(errors.names), directions.shape[1]
     kept = [*range(Q), *range(len(K) - W, len(K))]
-    return Departures(at_points @ directions, np.linalg.inv(K[np.ix_(kept, kept)]))
+    return Departures(at_points @ directions, np.linalg.inv(K[np.ix_(kept, kept)]), assumed)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,6 @@ before any data, from a model with ranges, and after some data, from a fit or a 
 
 from dahl_ident.planning.measurement_plan import Plan
 from dahl_ident.planning.planner import plan
-from dahl_ident.planning.trajectories import Trapezoid
+from dahl_ident.planning.trajectories import Multisine, Trapezoid
 
-__all__ = ["Plan", "Trapezoid", "plan"]
+__all__ = ["Multisine", "Plan", "Trapezoid", "plan"]

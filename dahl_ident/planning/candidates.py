@@ -21,7 +21,7 @@ from dahl_ident.elements import Model
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.question import BenchLimits, PlanRequest, limit
-from dahl_ident.planning.trajectories import Trapezoid
+from dahl_ident.planning.trajectories import PlannedMotion
 
 _CERTAIN = 0.95  # fraction of the draws that must stay within a limit
 _FREQUENCIES = 12  # most frequencies: six in each decade of the default range
@@ -48,7 +48,7 @@ class Candidates:
     rows: FloatArray
     variance: FloatArray  # (S, K) of ln gain and phase in one cycle
     # motions in time, whose periods are the cycles; empty for sines
-    motions: tuple[Trapezoid, ...] = ()
+    motions: tuple[PlannedMotion, ...] = ()
 
     @property
     def count(self) -> int:

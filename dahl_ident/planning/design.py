@@ -16,12 +16,14 @@ homogeneous function of the information, so that the search for the best design 
 - targets: -ln(sum_t (c_t' M^{-1} c_t / u_t^2)^q)/q; with one target c-optimality, with several
   close to the largest ratio of variance to target.
 
-Each level needs time for change-over and settling before it gives information. Levels are added,
-exchanged and removed one at a time while this improves the criterion, and the remaining time is
-distributed over them: with d_k the derivative of the criterion with respect to the seconds t_k of a
-level and d the mean of d_k weighted by t_k, every t_k is multiplied by (d_k/d)^p; at the optimum
-d_k <= d everywhere (the equivalence theorem), with equality where t_k > 0. Then cycles are rounded
-to whole numbers.
+**Continuous designs** are seconds t_k at each candidate, with a fixed sum. With d_k the derivative
+of the criterion with respect to t_k and d the mean of d_k weighted by t_k, every t_k is multiplied
+by (d_k/d)^p; at the optimum d_k <= d everywhere (the equivalence theorem), with equality where
+t_k > 0. For D-optimality without earlier data d times the time is 1.
+
+**With fixed costs** each level needs time for change-over and settling before it gives information.
+Levels are added, exchanged and removed one at a time while this improves the criterion, and the
+remaining time is distributed by the same multiplication; then cycles are rounded to whole numbers.
 
 Source: Pukelsheim, *Optimal Design of Experiments*, 2006, chapters 3 and 5; Silvey, Titterington
 and Torsney, *Commun. Stat. A* 7, 1379 (1978); Yu, *Ann. Stat.* 38, 1593 (2010).
@@ -61,8 +63,8 @@ def packed_information(
 
 
 @dataclass(frozen=True)
-class Criterion:
-    """D-optimality, or the uncertainty of targets, as a function of the cycles of a run."""
+class Term:
+    """One criterion on one model: D-optimality, or the uncertainty of targets."""
 
     # (..., K, S Q Q) information of one cycle at every candidate and draw; Q = P, or P + 2 with a
     # run's gain and phase after the parameters
@@ -70,9 +72,11 @@ class Criterion:
     known: FloatArray  # (S, P, P) information before the plan
     # s, standard deviation of a run's ln gain and phase; 0 if runs do not differ
     scatter: float = 0.0
-    runs: int = 1
     # (S, P, C) directions over their target standard uncertainties; None for D-optimality
     targets: FloatArray | None = None
+    # (T,) first of the columns of each target, whose variances are added; None for one column each
+    starts: IntArray | None = None
+    weight: float = 1.0  # in the sum of the terms
     between: FloatArray | None = None  # (P, P) covariance of the parameters between runs
     # number of the last parameters, departures, whose uncertainty is not part of the criterion
     departures: int = 0
@@ -94,22 +98,14 @@ class Criterion:
         left = np.linalg.inv(np.eye(P) + M @ self.between)
         return left @ M, left @ identity
 
-    def only(self, candidates: Sequence[int] | IntArray) -> Criterion:
-        """Return the criterion of some candidates, or of each of several sets, (designs, m)."""
-        return replace(self, packed=self.packed[np.asarray(candidates, dtype=np.intp)])
-
-    def at(self, cycles: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the criterion at the cycles of all candidates, and its sensitivities."""
+    def at(self, cycles: FloatArray, runs: int) -> tuple[FloatArray, FloatArray]:
+        """Return the weighted criterion, and its derivative with respect to the packed sums."""
         S, L = self.of_run(cycles)
-        value, slope = self._of_information(self.known + self.runs * S)
-        slope = (self.runs / len(self.known)) * (L.swapaxes(-1, -2) @ slope @ L)
-        return value, slope.reshape(*value.shape, -1)
+        value, slope = self._criterion(self.known + runs * S)
+        slope = (self.weight * runs / len(self.known)) * (L.swapaxes(-1, -2) @ slope @ L)
+        return self.weight * value, slope.reshape(*value.shape, -1)
 
-    def gradient(self, sensitivities: FloatArray) -> FloatArray:
-        """Return derivatives with respect to the cycles of this criterion's candidates."""
-        return np.asarray((self.packed @ sensitivities[..., None])[..., 0])
-
-    def _of_information(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _criterion(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean over draws, (...), and S times its derivative, (..., S, P, P)."""
         inverse = np.linalg.inv(M)
         if self.targets is None:
@@ -121,22 +117,73 @@ class Criterion:
             return -np.linalg.slogdet(part)[1].mean(axis=-1) / P, slope / P
         inverse_c = inverse @ self.targets
         variances = np.einsum("...spc,spc->...sc", inverse_c, self.targets)
-        top = variances.max(axis=-1, keepdims=True)
-        powers = (variances / top) ** (_NORM - 1.0)
-        total = (powers * variances / top).sum(axis=-1)
+        count = variances.shape[-1]
+        starts = np.arange(count) if self.starts is None else self.starts
+        sums = np.add.reduceat(variances, starts, axis=-1)
+        top = sums.max(axis=-1, keepdims=True)
+        powers = (sums / top) ** (_NORM - 1.0)
+        total = (powers * sums / top).sum(axis=-1)
         value = -(np.log(top[..., 0]) + np.log(total) / _NORM).mean(axis=-1)
-        share = powers / (total[..., None] * top)
+        share = np.repeat(powers / (total[..., None] * top), np.diff([*starts, count]), axis=-1)
         return value, (inverse_c * share[..., None, :]) @ inverse_c.swapaxes(-1, -2)
 
 
-def best_seconds(
-    criterion: Criterion,
+@dataclass(frozen=True)
+class Objective:
+    """The sum of terms over the same candidates, as a function of the cycles in one of `runs`."""
+
+    terms: tuple[Term, ...]
+    runs: int = 1
+
+    def only(self, candidates: Sequence[int] | IntArray) -> Objective:
+        """Return the objective of some candidates, or of each of several sets, (designs, m)."""
+        chosen = np.asarray(candidates, dtype=np.intp)
+        return replace(self, terms=tuple(replace(t, packed=t.packed[chosen]) for t in self.terms))
+
+    def at(self, cycles: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+        """Return the criterion and its sensitivities at the cycles of all candidates, (..., K)."""
+        terms = [term.at(cycles, self.runs) for term in self.terms]
+        return np.asarray(sum(value for value, _ in terms)), [slope for _, slope in terms]
+
+    def gradient(self, sensitivities: Sequence[FloatArray]) -> FloatArray:
+        """Return derivatives with respect to the cycles of this objective's candidates."""
+        pairs = zip(self.terms, sensitivities, strict=True)
+        return np.asarray(sum((t.packed @ s[..., None])[..., 0] for t, s in pairs))
+
+
+class ContinuousDesign(NamedTuple):
+    """Seconds at each candidate, the criterion, and the largest d_k/d - 1: 0 at the optimum."""
+
+    seconds: FloatArray
+    value: float
+    excess: float
+
+
+def continuous_design(
+    objective: Objective,
+    frequency_hz: FloatArray,
+    time: float,
+    *,
+    tolerance: float = 0.01,
+    iterations: int = 400,
+) -> ContinuousDesign:
+    """Return the best seconds at each candidate, without settling and change-over."""
+    even = np.full(len(frequency_hz), time / len(frequency_hz))
+    seconds = _best_seconds(objective, frequency_hz, time, even, iterations, tolerance)
+    value, sensitivities = objective.at(seconds * frequency_hz)
+    rate = objective.gradient(sensitivities) * frequency_hz
+    excess = rate.max() / (rate @ seconds / time) - 1.0
+    return ContinuousDesign(seconds, float(value), float(excess))
+
+
+def _best_seconds(
+    objective: Objective,
     frequency_hz: FloatArray,
     time: FloatArray | float,
     start: FloatArray,
     iterations: int,
     tolerance: float,
-    least: FloatArray | float,
+    least: FloatArray | float = 0.0,
 ) -> FloatArray:
     """Return the best distribution of each design's `time` over its levels, (..., m).
 
@@ -144,8 +191,8 @@ def best_seconds(
     """
     seconds = start * (time / start.sum(axis=-1, keepdims=True))
     power = np.ones((*seconds.shape[:-1], 1))
-    value, sensitivities = criterion.at((least + seconds) * frequency_hz)
-    rate = criterion.gradient(sensitivities) * frequency_hz
+    value, sensitivities = objective.at((least + seconds) * frequency_hz)
+    rate = objective.gradient(sensitivities) * frequency_hz
     for _ in range(iterations):
         mean = (rate * seconds).sum(axis=-1, keepdims=True) / time
         continues = (mean > 0.0) & (rate.max(axis=-1, keepdims=True) >= (1.0 + tolerance) * mean)
@@ -155,13 +202,13 @@ def best_seconds(
             moved = seconds * (rate / mean) ** power
             moved *= time / moved.sum(axis=-1, keepdims=True)
         moved = np.where(continues, moved, seconds)
-        new_value, sensitivities = criterion.at((least + moved) * frequency_hz)
+        new_value, sensitivities = objective.at((least + moved) * frequency_hz)
         # only D-optimality is sure to rise at full steps; a step that falls is halved and repeated
         fell = (new_value < value)[..., None] & (power >= 0.1)
         power = np.where(fell, 0.5 * power, power)
         if fell.all():
             continue
-        new_rate = criterion.gradient(sensitivities) * frequency_hz
+        new_rate = objective.gradient(sensitivities) * frequency_hz
         seconds, rate = np.where(fell, seconds, moved), np.where(fell, rate, new_rate)
         value = np.where(fell[..., 0], value, new_value)
     return np.asarray(seconds)
@@ -196,16 +243,20 @@ class Exchange:
 
     def __init__(
         self,
-        criterion: Criterion,
+        objective: Objective,
         bench: BenchTime,
+        pool: IntArray,
         coverage: Coverage | None = None,
     ) -> None:
-        self._criterion, self._bench = criterion, bench
+        self._objective, self._bench, self._pool = objective, bench, pool
         self._coverage = coverage or Coverage(1, 0.0, np.zeros(len(bench.frequency_hz)))
 
-    def best(self, time: float) -> Design | None:
+    def best(self, time: float, start: Sequence[int] = ()) -> Design | None:
         """Return the best levels for one run of `time` s; None if no level can be measured."""
-        chosen, value, fewest = list[int](), -np.inf, self._coverage.fewest
+        chosen, value, fewest = list(start), -np.inf, self._coverage.fewest
+        if chosen:
+            value = float(self._values([chosen], time)[0])
+            chosen = chosen if np.isfinite(value) else []
         improves = True
         while improves:
             added = self._promising(chosen, time) if len(chosen) < _MOST_LEVELS else []
@@ -231,14 +282,14 @@ class Exchange:
 
     def _best_cycles(
         self, levels: IntArray, time: float, iterations: int
-    ) -> tuple[Criterion, FloatArray]:
-        """Return the criterion and the best cycles of each design, (..., m); NaN if too short."""
+    ) -> tuple[Objective, FloatArray]:
+        """Return the objective and the best cycles of each design, (..., m); NaN if too short."""
         f = self._bench.frequency_hz[levels]
         least = LEAST_CYCLES / f
         spare = (time - self._bench.fixed(levels) - least.sum(axis=-1))[..., None]
-        sub = self._criterion.only(levels)
+        sub = self._objective.only(levels)
         shared = np.maximum(spare, _NO_TIME)
-        seconds = best_seconds(sub, f, shared, np.ones(f.shape), iterations, 0.003, least)
+        seconds = _best_seconds(sub, f, shared, np.ones(f.shape), iterations, 0.003, least)
         cycles = (least + np.where(spare > 0.0, seconds, 0.0)) * f
         return sub, np.where(spare >= 0.0, cycles, np.nan)
 
@@ -259,7 +310,7 @@ class Exchange:
 
     def _promising(self, chosen: list[int], time: float) -> list[int]:
         """Return the candidates that are best in addition to the chosen ones, at equal times."""
-        others = np.setdiff1d(np.arange(len(self._bench.frequency_hz)), chosen)
+        others = np.setdiff1d(self._pool, chosen)
         joined = np.column_stack([np.tile(chosen, (others.size, 1)), others]).astype(np.intp)
         least = (LEAST_CYCLES / self._bench.frequency_hz[joined]).sum(axis=-1)
         spare = time - self._bench.fixed(joined) - least
@@ -268,7 +319,7 @@ class Exchange:
             return []
         joined, each = joined[fits], spare[fits] / joined.shape[1]
         cycles = LEAST_CYCLES + each[:, None] * self._bench.frequency_hz[joined]
-        values, _ = self._criterion.only(joined).at(cycles)
+        values, _ = self._objective.only(joined).at(cycles)
         return [int(k) for k in joined[np.argsort(-values)[:_TRIED], -1]]
 
     def whole(self, levels: Sequence[int], time: float) -> Design:
@@ -279,7 +330,7 @@ class Exchange:
         cycles = np.maximum(np.floor(best + 1e-9), float(LEAST_CYCLES))
         while True:
             value, sensitivities = sub.at(cycles)
-            seconds, runs = self._bench.seconds(ordered, cycles), self._criterion.runs
+            seconds, runs = self._bench.seconds(ordered, cycles), self._objective.runs
             possible = 1.0 / f <= time - seconds + 1e-9
             if not possible.any():
                 return Design(ordered, cycles, runs, float(value), runs * seconds)

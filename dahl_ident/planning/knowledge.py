@@ -58,6 +58,7 @@ class Knowledge:
     # standard deviation of ln gain and of phase of a row of earlier data
     row_noise: float | None = None
     row_cycles: float = 1.0  # cycles averaged in such a row, if the data state it
+    problem: TableProblem | None = None  # of the earlier data
     scatter: float = 0.0  # standard deviation of ln gain and phase between runs in the earlier data
     between: FloatArray | None = None  # (P,) variances of theta between runs, if there are any
     errors: ErrorModel | None = None  # of an earlier fit
@@ -98,6 +99,10 @@ class Knowledge:
         levels: FloatArray,
         frequency_hz: FloatArray,
         controlled: str,
+        *,
+        model: Model | None = None,
+        harmonic: int = 1,
+        noise: str = "relative",
     ) -> TableProblem:
         """Return the problem of levels whose responses are not measured yet."""
         level: dict[str, Any] = {"drive" if controlled == "force" else "amplitude": levels}
@@ -106,10 +111,11 @@ class Knowledge:
             np.ones(len(levels)),
             controlled=controlled,
             motion=self.motion,
+            harmonic=harmonic,
             **level,
         )
         return TableProblem(
-            data, self.model, noise="relative", sensors=self.sensors, steady=self.steady
+            data, model or self.model, noise=noise, sensors=self.sensors, steady=self.steady
         )
 
     def model_values(self) -> list[FloatArray]:
@@ -217,6 +223,7 @@ def _of_table(
         problem.data.motion,
         noise,
         cycles,
+        wider,
         0.0 if errors is None else errors.rms(RUNS),
         between,
         errors,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -11,17 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number
-from dahl_ident.data.storage import place_of, write_whole
+from dahl_ident.data.storage import place_of, plain_data, write_whole
 from dahl_ident.diagnostics.formatting import listed, table
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
 from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_range
-from dahl_ident.planning.design import Design
-from dahl_ident.planning.forecast import Expected
-from dahl_ident.planning.motion_information import evaluate_motions, trapezoids_within
-from dahl_ident.planning.question import BenchLimits, PlanRequest
-from dahl_ident.planning.search import Search
-from dahl_ident.planning.trajectories import Trapezoid
+from dahl_ident.planning.design import Design, Objective, continuous_design
+from dahl_ident.planning.forecast import NOTHING, Expected, Forecast
+from dahl_ident.planning.motion_information import evaluate_motions, motions_of
+from dahl_ident.planning.question import BenchLimits, PlanRequest, is_expanded
+from dahl_ident.planning.search import LONGEST, Search
+from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
 from dahl_ident.units import Motion, percent, shown_unit, si_unit
 
@@ -32,8 +33,17 @@ if TYPE_CHECKING:
 
 _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
-_FEW_LEVELS = 30  # candidates from which the effect of a wider limit is computed
+_FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
+_NEARLY_ALL = 0.99  # fraction of the longest time that counts as all of it, as cycles are whole
+_HOURS = 7200.0  # s, from which the time is stated in hours as well
 _WIDER = 10.0  # factor by which a limit is widened to find its effect
+_COSTLY = _WIDER**0.75  # effect above that of the frequency or the time, its square root
+_MODEL_ERROR = {
+    "none": "the model is right",
+    "estimated": "the model errs as the earlier data show",
+    "assumed": "levels chosen as if the model erred by the noise of the earlier data, "
+    "which are too few to tell one from the other",
+}
 
 
 @dataclass(frozen=True)
@@ -45,7 +55,7 @@ class PlanStep:
     settling_cycles: int  # before measuring
     measured_cycles: int  # of a motion in time, the number of repeats
     seconds: float  # change-over, settling and measuring
-    motion: Trapezoid | None = None  # the motion in time; None for a sine
+    motion: PlannedMotion | None = None  # the motion in time; None for a sine
 
 
 @dataclass(frozen=True)
@@ -69,7 +79,7 @@ class Plan:
     target : mapping of str to float
         Relative uncertainties that were asked for; empty if time was given.
     reached : bool
-        Whether the plan is predicted to meet all targets.
+        Whether the plan is predicted to meet all targets, those of suspected parameters included.
     undetermined : tuple of str
         Quantities that the plan does not determine, and the limit that prevents it.
     assumptions : tuple of str
@@ -117,7 +127,7 @@ class Plan:
         Returns
         -------
         pandas.DataFrame
-            Columns ``value, before, after``; see `Expected`.
+            Columns ``value, before, after, low, high, scatter_share``; see `Expected`.
         """
         import pandas as pd
 
@@ -214,7 +224,7 @@ class Plan:
         write_whole(place, frame.to_csv(index=False).encode(), overwrite=overwrite)
         return place
 
-    def _check_moves(self, motions: list[Trapezoid]) -> None:
+    def _check_moves(self, motions: list[trajectories.PlannedMotion]) -> None:
         """Check that the moves to the motions' starts are within the limits of the exciter."""
         limits, position = self.search.question.limits, 0.0
         for i, motion in enumerate(motions, start=1):
@@ -230,22 +240,46 @@ class Plan:
                 )
             position = start
 
-    def curves(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return times and the uncertainty by plans of these times, for each quantity.
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the plan as JSON.
 
-        The quantities are the targets, or all parameters if time was given; uncertainties are NaN
-        if the time is too short.
+        Parameters
+        ----------
+        path : path
+            Ending in ``.json``.
+        overwrite : bool, default False
+            Replace an existing file.
+
+        Returns
+        -------
+        Path
+        """
+        place = place_of(path, "a plan", (".json",))
+        plain = plain_data(self.to_dict(), not_finite=lambda _: None)
+        write_whole(place, json.dumps(plain, indent=2).encode(), overwrite=overwrite)
+        return place
+
+    def curves(self) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
+        """Return time, uncertainty by plans and by a logarithmic grid, for each quantity.
+
+        The quantities are the targets, or all parameters if time was given. The grid has ten levels
+        with equal cycles; uncertainties are NaN if the time is too short.
         """
         times = self.seconds * np.array(_CURVE)
-        after = self.search.expected_after
-        plans = [self.expected if time == self.seconds else after(time) for time in times]
+        search = self.search
+        planned = [self.expected if t == self.seconds else search.expected_after(t) for t in times]
+        gridded = [search.expected_after(t, grid=True) for t in times]
+
+        def after(name: str, plans: Sequence[Mapping[str, Expected]]) -> FloatArray:
+            return np.array([e[name].after if e else np.nan for e in plans])
+
         return {
-            name: (times, np.array([plan[name].after if plan else np.nan for plan in plans]))
+            name: (times, after(name, planned), after(name, gridded))
             for name in self.target or self.expected
         }
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Plot the predicted uncertainty over bench time.
+        """Plot the predicted uncertainty over bench time, and that of a logarithmic grid.
 
         Parameters
         ----------
@@ -270,6 +304,8 @@ class Plan:
         head = f"{number} {'level' if sines else 'motion'}{'s' if number != 1 else ''}"
         head = f"{self.runs} runs of {head}" if self.runs > 1 else head
         end = "; meets the target" if self.reached else "; does NOT meet the target"
+        if all(self.expected[name].before <= most for name, most in self.target.items()):
+            end += ", which the data at hand meet already"
         rows = [
             (
                 name,
@@ -280,30 +316,59 @@ class Plan:
             )
             for name, e in self.expected.items()
         ]
+        hours = f" ({self.seconds / 3600.0:.2g} h)" * (self.seconds >= _HOURS)
+        legend = "Relative standard uncertainties"
+        if any(map(is_expanded, self.expected)):
+            legend += "; U(...) expanded, 95.45 %"
         return "\n".join(
             [
-                f"{head} in {self.seconds:.4g} s{end if self.target else ''}.",
+                f"{head} in {self.seconds:.4g} s{hours}{end if self.target else ''}.",
                 "",
                 self._table(),
                 "",
                 table([("", "value", "before", "after", "wanted"), *rows]),
-                "Relative standard uncertainties.",
+                f"{legend}.",
                 *(f"{text}." for text in self.undetermined),
+                *self._spare(),
                 f"Assumed: {'; '.join(self.assumptions)}.",
             ]
         )
 
+    def _spare(self) -> list[str]:
+        """Return the gain if the remaining time is used or a limit is wider, and how to use it."""
+        time = self.search.question.limits.time
+        if self.reached and np.isinf(time):
+            widened = {name: _widened(self.search, name) for name in self.target}
+            return [
+                f"The limit of {limit} costs time: if it were ten times wider, {name} would be as "
+                f"certain in 1/{gain**2:.2g} of the time."
+                for name, (limit, gain) in widened.items()
+                if gain > _COSTLY
+            ]
+        if not (self.reached and self.seconds < 0.5 * time):
+            return []
+        with_all = self.search.expected_after(time)
+        gain = ", ".join(f"{name} {percent(with_all[name].after, 3)}" for name in self.target)
+        lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {gain}."]
+        if self.runs == 1:
+            lines.append(
+                f"Repeat the plan in {min(5, int(time // self.seconds))} runs, each a new "
+                "mounting: only runs show the scatter between them; longer ones do not reduce it."
+            )
+        return lines
+
     def _table(self) -> str:
         """Return the steps as text, one line each."""
         rows = [_row(step) for step in self.steps]
-        names = list(rows[0])
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        names.sort(key=lambda name: name in ("period", "repeats", "seconds"))  # these come last
         units = {**trajectories.UNITS, "level": "N" if self.controlled == "force" else "m"}
         headings = [name.removesuffix("_hz").replace("_", " ") for name in names]
         for i, name in enumerate(names):
             if name in units:
                 headings[i] += f" [{shown_unit(units[name], self.motion)}]"
         lines = [
-            [str(i), *(_as_text(row[name]) for name in names)]
+            [str(i), *(_as_text(row.get(name, "-")) for name in names)]
             for i, row in enumerate(rows, start=1)
         ]
         return table([["", *headings], *lines])
@@ -315,14 +380,14 @@ def _as_text(value: float | str) -> str:
 
 
 def _row(step: PlanStep) -> dict[str, Any]:
-    """Return the fields of a step; for a motion, its parameters."""
+    """Return the fields of a step; for a motion, its kind and parameters."""
     fields = dict(vars(step))
     motion = fields.pop("motion")
     if motion is None:
         return fields
     return {
-        "motion": "trapezoid",
-        **vars(motion),
+        "motion": motion.kind,
+        **motion.parameters,
         "period": motion.period,
         "repeats": step.measured_cycles,
         "seconds": step.seconds,
@@ -338,9 +403,9 @@ def candidates_within(
     """Return the candidates within limits; motions are repeated for `lasting` s."""
     if question.recorded is None:
         return evaluate(question, limits, *grid(question, limits, count))
-    motions: Sequence[Trapezoid] | str = question.motions
+    motions: Sequence[PlannedMotion] | str = question.motions
     if isinstance(motions, str):
-        motions = trapezoids_within(limits, level_range(question, limits))
+        motions = motions_of(motions, limits, level_range(question, limits))
     return evaluate_motions(question.knowledge, motions, limits, question.recorded, lasting)
 
 
@@ -356,11 +421,12 @@ def undetermined(
     }
     for name, u in q.target.items() if q.has_numbers else ():
         if expected[name].after > 1.001 * u:
-            reached = _shown(expected[name].after)
-            missed[name] = f"{name} reaches a standard uncertainty of {reached}, not {_shown(u)}"
-    sentences = [
-        f"{text}; {_prevented_by(search, name, design.seconds)}" for name, text in missed.items()
-    ]
+            what = "" if is_expanded(name) else "a standard uncertainty of "
+            missed[name] = f"{name} reaches {what}{_shown(expected[name].after)}, not {_shown(u)}"
+    if q.suspects and search.suspect_ratio(design) > 1.0:
+        names = ", ".join(q.suspects)
+        missed.setdefault(names, f"the uncertainty of {names} does not meet its target")
+    sentences = [f"{text}; {_prevented_by(search, name)}" for name, text in missed.items()]
     if not search.can_be_judged(design):
         sentences.append(
             "these levels are too few to tell a wrong model from noise, so that a fit to them "
@@ -369,35 +435,49 @@ def undetermined(
     return tuple(sentences)
 
 
-def _prevented_by(search: Search, name: str, time: float) -> str:
-    """Return the limit that prevents a smaller uncertainty."""
+def _widened(search: Search, name: str) -> tuple[str, float]:
+    """Return the limit that, ten times wider, would reduce an uncertainty most, and how far."""
     q, widened = search.question, {"": np.inf}
-    base = _least_uncertainty(q, name, q.limits, time)
+    base = _least_uncertainty(q, name, q.limits)
     for limit in q.limits.stated:
         low, high = getattr(q.limits, limit)
         wider: dict[str, Any] = {limit: (low / _WIDER, high * _WIDER)}
         with suppress(ValidationError):
-            widened[limit] = _least_uncertainty(q, name, replace(q.limits, **wider), time)
+            widened[limit] = _least_uncertainty(q, name, replace(q.limits, **wider))
     if np.isfinite(q.limits.time):
-        widened["time"] = _least_uncertainty(q, name, q.limits, _WIDER * time)
+        widened["time"] = base / np.sqrt(_WIDER)
     best = min(widened, key=widened.__getitem__)
-    gain = base / widened[best]
+    return best.removesuffix("_hz"), base / widened[best]
+
+
+def _prevented_by(search: Search, name: str) -> str:
+    """Return the limit that prevents a smaller uncertainty."""
+    if name not in search.forecast.directions:
+        return "give more time or wider limits"
+    limit, gain = _widened(search, name)
+    if not limit:
+        return "no limit was stated that prevents it"
     if not gain > 1.25:
-        return "no limit alone prevents it: reduce the noise, or use a model that fits better"
+        if search.forecast.model_error == "estimated":
+            return "no limit alone prevents it: use a model that describes the data better"
+        return "no limit alone prevents it: reduce the noise, or fix a parameter"
     return (
-        f"the limit of {best.removesuffix('_hz')} prevents it: ten times wider, it would be "
-        f"{gain:.2g} times smaller"
+        f"the limit of {limit} prevents it: ten times wider, it would be {gain:.2g} times smaller"
     )
 
 
-def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits, time: float) -> float:
-    """Return the least uncertainty of a quantity after a time."""
-    question = replace(question, target={name: 1.0}, has_numbers=False, limits=limits)
-    expected = Search(question, candidates_within(question, limits)).expected_after(time)
-    return expected[name].after if expected else np.inf
+def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits) -> float:
+    """Return the uncertainty of a quantity with the best continuous design."""
+    candidates = candidates_within(question, limits)
+    few = Forecast.of(question, candidates).thinned()
+    term = few.term({name: 1.0}, few.before + NOTHING * np.eye(few.before.shape[-1]))
+    time = limits.time if np.isfinite(limits.time) else 1000.0
+    frequency_hz = candidates.frequency_hz
+    design = continuous_design(Objective((term,)), frequency_hz, time, tolerance=0.1)
+    return float(np.exp(-0.5 * design.value))
 
 
-def assumptions_of(search: Search) -> tuple[str, ...]:
+def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
     """Return the assumptions of the prediction."""
     q, known = search.question, search.question.knowledge
     force, length = (si_unit(kind, known.motion) for kind in ("force", "displacement"))
@@ -431,8 +511,9 @@ def assumptions_of(search: Search) -> tuple[str, ...]:
                 f"{', '.join(known.assumed)} within the range that a fit assumes (fix it in the "
                 "model to plan without)"
             )
-    errs = "errs as the earlier data show" if search.forecast.departures else "is right"
-    texts += [f"the model {errs}", "calibrations are exact"]
+    texts += [_MODEL_ERROR[search.forecast.model_error], "calibrations are exact"]
+    if design.seconds > _NEARLY_ALL * LONGEST and not np.isfinite(q.limits.time):
+        texts.append("no plan takes more than 30 days unless a time is given")
     return tuple(texts)
 
 

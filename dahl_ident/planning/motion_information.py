@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,19 +20,29 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import LEAST_CYCLES, Candidates, allowed
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.question import BenchLimits, RecordedForce, limit
-from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Trapezoid
+from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Multisine, PlannedMotion, Trapezoid
 from dahl_ident.problem.record_problem import RecordProblem
 
 _PER_PERIOD = 400  # most samples at which derivatives are computed: integrals err by 1e-3
 _LEAST_SAMPLES = 16  # in a period, even if the sample rate is low
 _SIMULATED = 4  # repeats from rest, after which the friction force is periodic as well
 _FEW_REPEATS = 8  # repeats for which the search computes the information
-_LEVELS, _SPEEDS = 24, 4  # numbers of strokes and of speeds of candidates
-_SLOWER = 2.0  # factor from one speed to the next
+_LEVELS, _SPEEDS, _BANDS = 24, 4, 4  # numbers of candidates for each kind of motion
+_SLOWER = 2.0  # factor from one speed or band to the next
+_LINES = 10  # highest over lowest frequency of a multisine
 
 
-def trapezoids_within(limits: BenchLimits, levels: tuple[float, float]) -> list[Trapezoid]:
-    """Return trapezoidal trajectories within the limits."""
+def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> list[PlannedMotion]:
+    """Return the candidates of a kind of motion within the limits."""
+    amplitudes = np.geomspace(*levels, _LEVELS).tolist()
+    low, high = limits.frequency_hz
+    if kind == "multisine":
+        if not np.isfinite(high):
+            raise ValidationError(
+                f"{limit('frequency_hz')} is missing; give the highest one of the multisine"
+            )
+        tops = [top for i in range(_BANDS) if (top := high / _SLOWER**i) >= low]
+        return [Multisine(max(top / _LINES, low), top, size) for size in amplitudes for top in tops]
     for name in ("speed", "acceleration"):
         if not np.isfinite(getattr(limits, name)[1]):
             raise ValidationError(
@@ -41,7 +52,7 @@ def trapezoids_within(limits: BenchLimits, levels: tuple[float, float]) -> list[
     v, a = limits.speed[1], limits.acceleration[1]
     return [
         Trapezoid(2.0 * size, min(v, float(np.sqrt(2.0 * size * a))) / _SLOWER**i, a)
-        for size in np.geomspace(*levels, _LEVELS).tolist()
+        for size in amplitudes
         for i in range(_SPEEDS)
     ]
 
@@ -59,7 +70,7 @@ class RepeatSums:
     weight: float  # number of measured samples per computed one, over the variance of the noise
 
     @classmethod
-    def of(cls, knowledge: Knowledge, motion: Trapezoid, recorded: RecordedForce) -> RepeatSums:
+    def of(cls, knowledge: Knowledge, motion: PlannedMotion, recorded: RecordedForce) -> RepeatSums:
         """Return the sums of a motion at every draw of the parameters."""
         rate = min(recorded.sample_rate, _PER_PERIOD / motion.period)
         m = max(round(motion.period * rate), _LEAST_SAMPLES)
@@ -105,7 +116,7 @@ class RepeatSums:
 
 def evaluate_motions(
     knowledge: Knowledge,
-    motions: Sequence[Trapezoid],
+    motions: Sequence[PlannedMotion],
     limits: BenchLimits,
     recorded: RecordedForce,
     lasting: float | None = None,
@@ -120,17 +131,19 @@ def evaluate_motions(
         slowest = min(motion.fastest_hz for motion in motions)
         raise ValidationError(
             f"sample_rate is {rate:g} Hz; expected at least {SAMPLES_PER_CYCLE} samples in a "
-            "trapezoid's move from end to end: "
+            f"trapezoid's move from end to end or a multisine's shortest cycle: "
             f"{SAMPLES_PER_CYCLE * slowest:.3g} Hz for the slowest motion; or slow the motions down"
         )
     peaks = np.array([motion.peaks for motion in resolved])
     sums = [RepeatSums.of(knowledge, motion, recorded) for motion in resolved]
-    sizes = {
+    sizes: dict[str, Any] = {
         "displacement": peaks[None, :, 0],
         "force": np.stack([of_motion.force for of_motion in sums], axis=1),
         "speed": peaks[None, :, 1],
         "acceleration": peaks[None, :, 2],
     }
+    if any(motion.kind != "trapezoid" for motion in resolved):
+        sizes["frequency_hz"] = np.array([[motion.fastest_hz for motion in resolved]])
     within = np.flatnonzero(allowed(limits, sizes, len(resolved)))
     period = np.array([motion.period for motion in resolved])[within]
     rows = [

@@ -10,6 +10,7 @@ import numpy as np
 
 from dahl_ident.arrays import non_negative_array, positive_number, whole_number
 from dahl_ident.data.columns import CONTROLLED, one_of
+from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import STEADY, Steady
 from dahl_ident.errors import ValidationError, argument
 from dahl_ident.planning.candidates import evaluate
@@ -24,8 +25,10 @@ from dahl_ident.planning.measurement_plan import (
     undetermined,
 )
 from dahl_ident.planning.question import (
+    RESPONSE,
     BenchLimits,
     PlanRequest,
+    larger_model,
     limit,
     motions_among,
     noise_of_cycle,
@@ -33,7 +36,7 @@ from dahl_ident.planning.question import (
     target_of,
 )
 from dahl_ident.planning.search import Search
-from dahl_ident.planning.trajectories import Trapezoid
+from dahl_ident.planning.trajectories import PlannedMotion
 
 
 def plan(
@@ -46,7 +49,9 @@ def plan(
     scatter: float | None = None,
     runs: int | None = None,
     controlled: str = "displacement",
-    candidates: int | str | Sequence[tuple[float, float]] | Sequence[Trapezoid] = 80,
+    candidates: int | str | Sequence[tuple[float, float]] | Sequence[PlannedMotion] = 240,
+    larger: Element | None = None,
+    suspects: Mapping[str, float] | None = None,
     change_over: float = 1.0,
     settled: float = 0.01,
     between_runs: float = 0.0,
@@ -68,9 +73,11 @@ def plan(
         seconds in total.
     target : mapping, sequence of str, or str, optional
         Mapping from a parameter, or a product of powers such as ``"f_max/sigma"``, to its target
-        relative standard uncertainty: the plan meets all targets in the least time. Names only:
-        the plan minimises their uncertainty in ``limits["time"]``. By default the plan is
-        D-optimal in that time.
+        relative standard uncertainty, or from ``"U(f_max)"`` to its relative expanded uncertainty
+        (95.45 %): the plan meets all targets in the least time. Names only: the plan minimises
+        their uncertainty in ``limits["time"]``. By default the plan is D-optimal in that time.
+        ``"response"`` is the device's response over the candidates, root mean square of ln gain
+        and phase.
     ranges : mapping of str to (float, float), optional
         Range that contains a parameter with 95 % probability. The search uses it, but the predicted
         uncertainty does not include it.
@@ -86,10 +93,16 @@ def plan(
         Number of runs. By default the best one: 1 without scatter, otherwise up to 8.
     controlled : {"displacement", "force"}
         The controlled quantity. With "force", levels are drives of the whole plant.
-    candidates : int, sequence of (level, frequency_hz), str, or sequence of motions, default 80
-        The levels to choose from, or their number. ``"trapezoid"`` stands for trapezoidal motions
-        in time within the limits, to be fitted as records; or give a list of
-        :class:`dahl_ident.planning.Trapezoid`.
+    candidates : int, sequence of (level, frequency_hz), str, or sequence of motions, default 240
+        The levels to choose from, or their number. ``"trapezoid"`` and ``"multisine"`` stand for
+        motions in time within the limits, to be fitted as records; or give them as
+        :class:`dahl_ident.planning.Trapezoid` and :class:`dahl_ident.planning.Multisine`.
+    larger : Element, optional
+        Model in which `suspects` are parameters; by default the model itself.
+    suspects : mapping of str to float, optional
+        Parameters that may be needed although the model fixes or omits them, such as ``{"alpha":
+        0.1}``, and the standard uncertainty of each in the larger model that the plan must meet:
+        relative for positive parameters, absolute for others.
     change_over : float, default 1
         Seconds from one level to the next.
     settled : float, default 0.01
@@ -121,8 +134,9 @@ def plan(
     Notes
     -----
     A plan from a fit takes the fit's noise, model error and scatter between runs. The model error
-    is similar at levels close to each other, so levels are spread. A plan from a posterior has no
-    model error.
+    is similar at levels close to each other, so levels are spread; if the earlier data are too few
+    to distinguish it from noise, levels are chosen as if both were equally large. A plan from a
+    posterior has no model error.
 
     Without earlier data, a plan has as many levels as a fit needs to distinguish a wrong model from
     noise; if the time does not allow so many, the target is not met.
@@ -164,7 +178,10 @@ def plan(
     motions = motions_among(candidates)
     if motions:
         for_sines_only = {
+            "target 'response'": RESPONSE in targets,
             "scatter": bool(scatter),
+            "suspects": bool(suspects),
+            "larger": larger is not None,
             "runs": runs not in (None, 1),
             argument("controlled", "force"): controlled == "force",
         }
@@ -196,6 +213,8 @@ def plan(
         noise_of_cycle(noise, knowledge),
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
         None if runs is None else whole_number(runs, "runs", 1),
+        larger_model(knowledge, larger, suspects),
+        dict(suspects or {}),
     )
     if isinstance(candidates, int):
         options = candidates_within(question, bench, whole_number(candidates, "candidates", 2))
@@ -215,9 +234,7 @@ def _of_motions(question: PlanRequest) -> Plan:
 
     This information depends on the number of repeats, because a record's unknowns take about one.
     """
-    design = Search(question, candidates_within(question, question.limits)).best()
-    lasting = design.seconds - question.costs["change_over"] * len(design.levels)
-    lasting /= len(design.levels)
+    lasting = Search(question, candidates_within(question, question.limits)).best().seconds
     search = Search(question, candidates_within(question, question.limits, lasting=lasting))
     return _plan(search, search.best())
 
@@ -247,7 +264,7 @@ def _plan(search: Search, design: Design) -> Plan:
         target=dict(q.target) if q.has_numbers else {},
         reached=search.reached(design),
         undetermined=undetermined(search, design, expected),
-        assumptions=assumptions_of(search),
+        assumptions=assumptions_of(search, design),
         change_over=change_over,
         motion=q.knowledge.motion,
         search=search,

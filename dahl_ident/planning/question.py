@@ -10,11 +10,16 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, positive_number
+from dahl_ident.diagnostics.confidence_levels import coverage_factor
+from dahl_ident.elements import Element, Model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError, argument, choices, spelled
 from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.trajectories import Trapezoid
+from dahl_ident.planning.trajectories import KINDS, PlannedMotion
 
+RESPONSE = "response"
 _POWER = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\^(?P<power>-?\d+(?:\.\d+)?))?")
+_EXPANDED = re.compile(r"U\((?P<quantity>.+)\)")
 
 
 def limit(name: str) -> str:
@@ -108,17 +113,24 @@ class PlanRequest:
     noise: CycleNoise = field(default_factory=lambda: CycleNoise(0.0))
     scatter: float = 0.0
     runs: int | None = 1
+    larger: Model | None = None
+    suspects: dict[str, float] = field(default_factory=dict)
     recorded: RecordedForce | None = None
-    motions: str | tuple[Trapezoid, ...] = ()
+    motions: str | tuple[PlannedMotion, ...] = ()
 
 
 def noise_of_cycle(noise: float | Mapping[str, float] | None, knowledge: Knowledge) -> CycleNoise:
     """Return the noise of one cycle, as given or from the earlier data."""
     if noise is None:
         if knowledge.row_noise is None:
+            reason, other = "the noise is unknown before any data", ""
+            if knowledge.sample_noise is not None:
+                reason = "a fit of records has the noise of a sample, not of one cycle of a sine"
+                trapezoid = argument("candidates", "trapezoid", option="motion")
+                other = f"; or plan motions in time ({trapezoid}), of which it is known"
             raise ValidationError(
-                f"plan: the noise of a cycle is unknown; give {argument('noise', 0.01)} (of ln "
-                "gain and phase), or its parts: relative, force in N, displacement in m"
+                f"plan: {reason}; give {argument('noise', 0.01)} (of ln gain and phase in one "
+                f"cycle), or its parts: relative, force in N, displacement in m{other}"
             )
         return CycleNoise(knowledge.row_noise * float(np.sqrt(knowledge.row_cycles)))
     if not isinstance(noise, Mapping):
@@ -156,19 +168,19 @@ def recorded_force(
     return RecordedForce(positive_number(noise["force"], "noise['force']"), rate)
 
 
-def motions_among(candidates: Any) -> str | tuple[Trapezoid, ...]:
+def motions_among(candidates: Any) -> str | tuple[PlannedMotion, ...]:
     """Return the motions in time that `candidates` has; empty for sines."""
     if isinstance(candidates, int):
         return ()
-    if candidates == "trapezoid":
-        return "trapezoid"
+    if isinstance(candidates, str) and candidates in KINDS:
+        return candidates
     if isinstance(candidates, str) or not np.iterable(candidates):
         raise ValidationError(
             f"candidates is {candidates!r}; expected a number, pairs of level and frequency, a "
-            "list of motions, or 'trapezoid'"
+            f"list of motions, or one of {', '.join(KINDS)}"
         )
     listed = tuple(candidates)
-    are_motions = [isinstance(candidate, Trapezoid) for candidate in listed]
+    are_motions = [isinstance(candidate, PlannedMotion) for candidate in listed]
     if any(are_motions) and not all(are_motions):
         raise ValidationError("candidates holds motions and others; plan either of them")
     return listed if any(are_motions) else ()
@@ -188,10 +200,47 @@ def target_of(target: Any) -> tuple[dict[str, float], bool]:
     return checked, bool(checked)
 
 
+def larger_model(
+    knowledge: Knowledge, larger: Element | None, suspects: Mapping[str, float] | None
+) -> Model | None:
+    """Return the model in which suspected parameters are free; None if there are none."""
+    if not suspects:
+        if larger is not None:
+            raise ValidationError("larger is given without suspects; name its parameters there")
+        return None
+    for name, u in suspects.items():
+        positive_number(u, f"suspects[{name!r}]")
+    model = as_model(larger) if larger is not None else knowledge.model
+    names = {p.name for p in model.parameters}
+    unknown = sorted(set(suspects) - names)
+    if unknown:
+        raise ValidationError(
+            f"suspects names {', '.join(unknown)}, which {model!r} does not have; give a model "
+            "that has them, in Python as larger="
+        )
+    return model.with_free([*suspects, *(names & set(knowledge.names))])
+
+
+# Quantities: parameters, products of their powers, U(...) of either, the predicted response
+
+
+def is_expanded(name: str) -> bool:
+    """Return whether a quantity is an expanded uncertainty, ``U(...)``."""
+    return _EXPANDED.fullmatch(name) is not None
+
+
+def least_factor(name: str) -> float:
+    """Return the least coverage factor of an expanded uncertainty; 1 for others."""
+    return coverage_factor(np.inf) if is_expanded(name) else 1.0
+
+
 def powers_of(expression: str, names: tuple[str, ...]) -> FloatArray:
     """Return the power of each parameter in a product such as ``sigma^2/f_max``."""
+    text = expression.replace(" ", "")
+    expanded = _EXPANDED.fullmatch(text)
+    product = expanded["quantity"] if expanded else text
     powers = np.zeros(len(names))
-    for i, part in enumerate(expression.replace(" ", "").split("/")):
+    for i, part in enumerate(product.split("/")):
         for factor in part.split("*"):
             match = _POWER.fullmatch(factor)
             if match is None:

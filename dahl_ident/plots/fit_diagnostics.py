@@ -301,7 +301,7 @@ def plot_budget(rows: Sequence[tuple[str, str, float]], *, ax: Axes | None = Non
 
 @style.house_style()
 def plot_bench_time(
-    curves: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    curves: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]],
     target: Mapping[str, float] | None = None,
     *,
     ax: Axes | None = None,
@@ -310,21 +310,31 @@ def plot_bench_time(
 
     Parameters
     ----------
-    curves : mapping of str to (time, uncertainty)
-        For each quantity: seconds, and its uncertainty; NaN where a time is too short.
+    curves : mapping of str to (time, planned, grid)
+        For each quantity: seconds, and its uncertainty with plans and with a logarithmic grid; NaN
+        where a time is too short.
     target : mapping of str to float, optional
         Target uncertainties, drawn as dotted lines.
 
     Examples
     --------
-    >>> axis = plot_bench_time({"f_max": ([10.0, 40.0], [0.02, 0.01])})
+    >>> axis = plot_bench_time({"f_max": ([10.0, 40.0], [0.02, 0.01], [0.04, 0.02])})
     >>> len(axis.lines)
-    1
+    2
     """
     axis = style.axes(ax, size=(5.2, 3.4))
-    for i, (name, (time, u)) in enumerate(curves.items()):
+    for i, (name, (time, planned, grid)) in enumerate(curves.items()):
         colour = style.SERIES[i % len(style.SERIES)]
-        axis.plot(time, 100.0 * np.asarray(u), "o-", color=colour, label=name)
+        axis.plot(time, 100.0 * np.asarray(planned), "o-", color=colour, label=f"{name}, plan")
+        if np.isfinite(grid).any():
+            axis.plot(
+                time,
+                100.0 * np.asarray(grid),
+                "s--",
+                color=colour,
+                mfc="white",
+                label=f"{name}, logarithmic grid",
+            )
         if target and name in target:
             axis.axhline(100.0 * target[name], color=colour, ls=":", lw=1.0)
     axis.set(
