@@ -452,8 +452,8 @@ One device of {records} records takes {seconds:.2f} s of one processor here ({_l
 The driver's memory grows with the number of files (see Scale), so make it 50 campaigns of 20,000
 devices, one TOML file and folder each, on one Dask cluster; a driver each, as many at a time as
 keep the workers busy. Put records where workers read them by path (object storage that
-is mounted, or a parallel file system). A driver
-keeps about {seconds * 200:,.0f} workers busy, at 5 ms a device. `pandas.read_parquet` of the
+is mounted, or a parallel file system); `--send-files` makes the driver's network the limit. A
+driver keeps about {seconds * 200:,.0f} workers busy, at 5 ms a device. `pandas.read_parquet` of the
 folders' `results.parquet` gives the table for `di.population`, one parameter at a time.
 """
 

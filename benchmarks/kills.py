@@ -42,8 +42,8 @@ COMMANDS = {
     "demo": "demo -o out --overwrite",
 }
 _DATES = re.compile(rb"D:\d{14}\S*|\d{4}-\d\d-\d\d[T ]\d\d:\d\d[^<\"]*|/ID\s*\[<\w+><\w+>\]")
-_GROWING = {"journal.jsonl", "chain.h5"}
-"""Files that are not written at once; the first holds seconds."""
+_GROWING = {"journal.jsonl", "digests.json", "chain.h5"}
+"""Files that are not written at once; the first two hold seconds and times."""
 
 
 def main() -> None:
@@ -145,7 +145,7 @@ def _contents(name: str, inputs: Path, place: Path) -> dict[str, bytes]:
 
 
 def _lasting(path: Path) -> bytes:
-    if path.name == "journal.jsonl":
+    if path.name == "journal.jsonl" or path.name == "digests.json":
         return b""
     if path.suffix in (".h5", ".parquet"):
         return _numbers(path)

@@ -11,7 +11,8 @@ import subprocess
 import sys
 import time
 import warnings
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from tests.campaign_cases import (
 )
 
 
-def test_waveforms_with_reports_and_any_executor(tmp_path):
+def test_waveforms_with_content_sent_along_and_any_executor(tmp_path):
     record = di.load_dataset("plant_recording")
     record.save(tmp_path / "p1.csv")
     content = {
@@ -41,7 +42,7 @@ def test_waveforms_with_reports_and_any_executor(tmp_path):
         "output": {"folder": str(tmp_path / "results"), "reports": True},
     }
     with ThreadPoolExecutor(1) as pool:
-        table = di.campaign(content, jobs=1, executor=pool).table
+        table = di.campaign(content, jobs=1, executor=pool, send_files=True).table
     assert table["mass"].iloc[0] == pytest.approx(0.3, rel=2e-3)
     assert (tmp_path / "results" / "reports" / table["report"].iloc[0]).stat().st_size > 1000
 
@@ -88,10 +89,14 @@ import time
 from distributed import LocalCluster
 
 if __name__ == "__main__":
-    protocol, port = sys.argv[1:]
+    protocol, port, version = sys.argv[1:]
+    if version:
+        import dahl_ident.version
+
+        dahl_ident.version.__version__ = version
     with LocalCluster(
         n_workers=1, threads_per_worker=1, protocol=protocol, host="127.0.0.1",
-        scheduler_port=int(port), processes=True, dashboard_address=None,
+        scheduler_port=int(port), processes=not version, dashboard_address=None,
     ) as cluster:
         print(cluster.scheduler_address, flush=True)
         sys.stdin.read()
@@ -99,12 +104,12 @@ if __name__ == "__main__":
 
 
 class Cluster:
-    """A Dask scheduler with a worker, which can be killed."""
+    """A Dask scheduler with a worker, which can be killed and started again."""
 
-    def __init__(self, folder, protocol="tcp://"):
+    def __init__(self, folder, protocol="tcp://", version=""):
         self._script = folder / "cluster.py"
         self._script.write_text(CLUSTER)
-        self._protocol = protocol
+        self._protocol, self._version = protocol, version
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self._port = str(free.getsockname()[1])
@@ -112,7 +117,7 @@ class Cluster:
 
     def start(self):
         self._process = subprocess.Popen(
-            [sys.executable, str(self._script), self._protocol, self._port],
+            [sys.executable, str(self._script), self._protocol, self._port, self._version],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True,
         )  # fmt: skip
@@ -153,28 +158,50 @@ def dask_leaks():
 @pytest.mark.versions
 def test_a_dask_scheduler_gives_the_serial_table(cluster, tmp_path, run):
     make_tables(tmp_path, 3)
-    run("campaign", str(as_toml(tmp_path)), "--scheduler", cluster.address)
+    run("campaign", str(as_toml(tmp_path)), "--scheduler", cluster.address, "--send-files")
     assert_equal(results(tmp_path), serial(tmp_path))
 
 
 @pytest.mark.usefixtures("dask_leaks")
-def test_a_scheduler_that_dies_ends_the_campaign_with_what_is_done(cluster, tmp_path):
+def test_a_scheduler_that_dies_and_comes_back_loses_nothing(cluster, tmp_path):
+    make_tables(tmp_path, 3)
+
+    def restart(done, *_):
+        if done == 2:
+            cluster.kill()
+            cluster.start()
+
+    done = di.campaign(definition(tmp_path), scheduler=cluster.address, progress=restart)
+    assert len(done.to_do) == 3
+    assert_equal(done.table, serial(tmp_path))
+
+
+@pytest.mark.usefixtures("dask_leaks")
+def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(cluster, tmp_path):
     make_tables(tmp_path, 3)
 
     def lose(done, *_):
         if done == 2:
             cluster.kill()
 
-    with pytest.raises(DataError, match=r"lost: .*; 2 of 3 fits are in .*others"):
-        di.campaign(definition(tmp_path), scheduler=cluster.address, progress=lose)
+    with pytest.raises(DataError, match=r"not answered for 2 s; 2 of 3 fits are in .*others"):
+        di.campaign(definition(tmp_path), scheduler=cluster.address, patience=2.0, progress=lose)
     assert results(tmp_path)["status"].tolist() == ["trusted"] * 2
     rest = di.campaign(definition(tmp_path), jobs=1)
     assert len(rest.to_do) == 1
     assert_equal(rest.table, serial(tmp_path))
 
 
-def test_a_worker_of_another_version_is_named(tmp_path):
+@pytest.mark.usefixtures("dask_leaks")
+def test_workers_of_another_version_are_named_before_anything_runs(tmp_path):
     make_tables(tmp_path, 2)
+    with (
+        Cluster(tmp_path, version="0.0.1") as cluster,
+        pytest.raises(
+            ValidationError, match=r"1 workers differ .* has dahl_ident 0\.0\.1; install"
+        ),
+    ):
+        di.campaign(definition(tmp_path), scheduler=cluster.address)
     with Changed("d000", version="0.0.1") as pool:
         table = di.campaign(definition(tmp_path), executor=pool).table
     assert table["error"].str.contains("this worker has dahl_ident").tolist() == [True, False]
@@ -207,18 +234,36 @@ def test_a_scheduler_behind_certificates(tmp_path, monkeypatch):
     assert_equal(done.table, serial(tmp_path))
 
 
+class _Elsewhere(ThreadPoolExecutor):
+    """Workers that do not have the files of this machine."""
+
+    def submit(self, function, /, *arguments, **_):
+        job, *others = arguments
+        files = tuple((f"/elsewhere{name}", content) for name, content in job.files)
+        return super().submit(function, replace(job, files=files), *others)
+
+
 def test_files_that_a_worker_does_not_see_are_done_by_a_second_call(tmp_path):
     make_tables(tmp_path, 2)
-    with Changed("d000", files=(str(tmp_path / "elsewhere.csv"),)) as pool:
+    with _Elsewhere(1) as pool:
         first = di.campaign(definition(tmp_path), executor=pool)
-    assert first.table["error"].str.contains("elsewhere.csv: cannot be read")[0]
-    second = di.campaign(definition(tmp_path), jobs=1)
-    assert second.to_do == ("d000",)
+        assert first.table["error"].str.contains("send them with send_files=True").all()
+        second = di.campaign(definition(tmp_path), executor=pool, send_files=True)
+    assert len(second.to_do) == 2
     assert_equal(second.table, serial(tmp_path))
 
 
-def test_an_executor_that_takes_no_jobs_ends_the_campaign(tmp_path):
+class _Silent(ThreadPoolExecutor):
+    """An executor from which nothing comes back."""
+
+    def submit(self, *_, **__):
+        return Future()
+
+
+def test_an_executor_that_does_not_answer_is_not_waited_for(tmp_path):
     make_tables(tmp_path, 2)
+    with _Silent(1) as pool, pytest.raises(DataError, match="executor has not answered for 1 s; 0"):
+        di.campaign(definition(tmp_path), executor=pool, timeout=0.5, patience=0.5)
     ended = ThreadPoolExecutor(1)
     ended.shutdown()
     with pytest.raises(DataError, match="takes no jobs any more"):

@@ -100,15 +100,13 @@ def test_a_line_cut_off_by_a_crash_is_done_again(tmp_path):
     assert_equal(again.table, before)
 
 
-def test_changed_options_repeat_all_fits_and_the_former_results_are_kept(tmp_path):
+def test_changed_options_are_named_before_anything_runs(tmp_path):
     make_tables(tmp_path, 2)
-    first = di.campaign(definition(tmp_path), jobs=1).table
-    redone = di.campaign(definition(tmp_path, fit__noise="absolute"), jobs=1)
+    di.campaign(definition(tmp_path), jobs=1)
+    with pytest.raises(DataError, match=r'fit was \{\}, now \{"noise": "absolute"\}'):
+        di.campaign(definition(tmp_path, fit__noise="absolute"), jobs=1)
+    redone = di.campaign(definition(tmp_path, fit__noise="absolute"), jobs=1, redo=True)
     assert len(redone.to_do) == 2
-    assert (redone.table["f_max"] != first["f_max"]).all()
-    again = di.campaign(definition(tmp_path), jobs=1)
-    assert again.to_do == ()
-    assert_equal(again.table, first)
 
 
 WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
@@ -313,6 +311,8 @@ def test_what_is_not_a_file_is_a_row_and_is_not_waited_for(tmp_path, run):
     done = run("campaign", path, "--jobs", "1")
     assert (done.status, "1 trusted, 1 failed" in done.out) == (0, True)
     assert "is a pipe; expected a file" in results(tmp_path)["error"][1]
+    sent = run("campaign", path, "--jobs", "1", "--send-files", "--redo")
+    assert "1 trusted, 1 failed" in sent.out
     covariates = definition(tmp_path, files__covariates=str(tmp_path / "d001_r0.csv"))
     with pytest.raises(DataError, match="is a pipe; expected a file"):
         di.campaign(covariates, dry_run=True)

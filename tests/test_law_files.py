@@ -189,7 +189,8 @@ def test_a_campaign_takes_it_to_its_workers(file, run):
     done = run("campaign", str(lab), "--jobs", "2")
     assert (done.status, "2 to do; 2 trusted" in done.out) == (0, True)
     file.write_text(LAW.format(kind=kind, factor=2.0))
-    redone = di.campaign(lab, jobs=1)
+    assert "laws was" in run.refused("campaign", lab)
+    redone = di.campaign(lab, jobs=1, redo=True)
     assert redone.table["k"].to_numpy() == pytest.approx([15.0, 15.0], rel=0.02)
     lab.write_text(f"laws = 3\n{lab.read_text().partition(chr(10))[2]}")
     with pytest.raises(DataError, match="laws is 3; expected the path of a Python file, or a list"):

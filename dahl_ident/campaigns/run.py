@@ -1,7 +1,8 @@
 """The public function that runs the missing fits of a campaign and writes its table.
 
 The journal has one line for each fit, and the table is made from these lines. After a crash the
-last line may be incomplete; it is dropped when the file is opened again.
+last line may be incomplete; it is dropped when the file is opened again. Only the keys and the
+positions of the lines are held in memory.
 """
 
 from __future__ import annotations
@@ -9,24 +10,26 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from dahl_ident.arrays import positive_number, whole_number
 from dahl_ident.campaigns.definition import Definition, Task, read_definition
 from dahl_ident.campaigns.engine import (
-    TIMEOUT,
+    PATIENCE,
+    Limits,
+    Local,
     LostError,
-    dask,
+    Place,
+    Scheduler,
     default_workers,
-    local,
-    local_memory,
     run_jobs,
 )
 from dahl_ident.campaigns.worker import Job, Row, digest_of
@@ -38,10 +41,11 @@ from dahl_ident.data.storage import (
     place_of,
     put_in_place,
     read_text,
+    regular,
     with_texts,
     write_whole,
 )
-from dahl_ident.errors import DataError, ModelError
+from dahl_ident.errors import DataError, ModelError, argument
 from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
@@ -52,6 +56,7 @@ if TYPE_CHECKING:
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
 _TRIAL_FITS = 3  # fits that show whether the options of a new campaign can be used at all
+_ROWS_AT_ONCE = 2000  # rows held as dictionaries, which take ten times the memory of a table
 _JOURNAL_ONLY = ("key", "retry", "refused")
 _FIRST_COLUMNS = ("device", "run", "status", "error", "statements")
 
@@ -160,16 +165,19 @@ def campaign(
     jobs: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
-    timeout: float = TIMEOUT,
+    timeout: float | None = None,
     memory: float | None = None,
+    patience: float = PATIENCE,
+    send_files: bool = False,
     dry_run: bool = False,
+    redo: bool = False,
     progress: Callable[[int, int, Mapping[str, Any]], None] | None = None,
 ) -> Campaign:
     """Read, extract and fit the files of many devices; one row of a table for each fit.
 
     The key of a result is a digest of everything that it depends on: the files, the options and the
-    version. When a campaign is run again, only missing fits are computed, and those whose files,
-    options or version have changed.
+    version. When a campaign is run again, only missing fits are computed, and those whose files
+    have changed.
 
     Parameters
     ----------
@@ -179,17 +187,26 @@ def campaign(
         Number of processes on this machine, with one numerical thread each; by default the number
         of processors. With an executor or a scheduler: the number of fits at a time.
     executor : concurrent.futures.Executor, optional
-        Runs the fits instead, where the files have the same paths.
+        Runs the fits instead.
     scheduler : str, optional
         Address of a Dask scheduler whose workers run the fits instead, ``tls://host:8786``.
-    timeout : float, default 600
-        Seconds after which the fit of a device is stopped, reading included.
+    timeout : float, optional
+        Seconds after which the fit of a device is stopped, reading included. By default ten times
+        the median of the fits so far, at least 60 s; 600 s until three fits have ended.
     memory : float, optional
         GB that the process of a fit may use, where the system can limit it (Linux). By default
         the memory of the machine shared between the jobs, at least 2 GB; elsewhere that of the
         worker's machine.
+    patience : float, default 120
+        Seconds without an answer after which the scheduler or the executor is given up; for an
+        executor they are counted from the end of `timeout`.
+    send_files : bool, default False
+        Send the contents of the files to workers that cannot access the paths.
     dry_run : bool, default False
         List what would be done, and do nothing.
+    redo : bool, default False
+        Allow options or version to differ from those of existing results; all fits are then
+        repeated.
     progress : callable, optional
         Called after each fit with the number done, the number to do and the new row.
 
@@ -203,13 +220,14 @@ def campaign(
     ------
     DataError
         If the definition is wrong in any part; if the first fits all fail because of the options
-        or the model; if another process runs the same campaign; or if the scheduler or the
-        executor is lost: results until then are in the table, and the same call does the others.
+        or the model; if options changed and `redo` is not set; if another process runs the
+        same campaign; or if the scheduler or the executor does not answer any more: results until
+        then are in the table, and the same call does the others.
     ModelError
         If a law of the model is defined in an interactive session, which no process can import.
     ValidationError
-        If `jobs` is not a whole number of at least 1, a limit is not a positive number, or no
-        scheduler answers.
+        If `jobs` is not a whole number of at least 1, a limit is not a positive number, no
+        scheduler answers, or its workers have another version of this package.
 
     Notes
     -----
@@ -233,53 +251,58 @@ def campaign(
     {'device': ['clean', 'noisy'], 'sigma': [30.0, 30.0]}
     """
     definition = read_definition(source)
-    positive_number(timeout, "timeout")
-    if memory is not None:
-        positive_number(memory, "memory")
+    for name, limit in (("timeout", timeout), ("memory", memory)):
+        if limit is not None:
+            positive_number(limit, name)
     workers = None if jobs is None else whole_number(jobs, "jobs", 1)
     folder, laws = definition.folder, _laws(definition)
-    place = folder / _JOURNAL
     if dry_run:
-        return _before(definition, _by_key(definition), _read_journal(place)[0])
+        tasks = _by_key(definition)
+        agree = _options_agree(definition, redo)
+        return _before(definition, tasks, read_journal(folder / _JOURNAL)[0] if agree else ())
     make_folder(folder)
-    if (table := folder / "results.csv").exists() and not place.exists():
+    if (table := folder / "results.csv").exists() and not (folder / _JOURNAL).exists():
         raise DataError(
             f"{definition.source}: {table} exists, and is not of a campaign; move it away, or give "
             "another folder in [output]"
         )
     lost: LostError | None = None
-    with locked(place, DataError), ExitStack() as stack:
-        results, end = _read_journal(place)
-        tasks = _by_key(definition)
-        before = _before(definition, tasks, results)
-        missing = [key for key in tasks if key not in results]
-        work = ((key, _job(definition, tasks[key], laws)) for key in missing)
-        if scheduler is not None:
-            executor, cores = stack.enter_context(dask(scheduler))
-            workers = workers or cores
-        workers = workers or default_workers()
-        if executor is None:
-            executor = stack.enter_context(local(workers))
-            memory = memory or local_memory(workers)
-        done = run_jobs(work, executor, workers, timeout, memory)
-        if missing and not before.finished:
-            done = _unless_refused(done, min(_TRIAL_FITS, len(missing)), definition.source)
-        with _opened(place, end) as journal:
-            try:
-                for number, (key, row) in enumerate(done, start=1):
-                    line = json.dumps({"key": key, **row}, ensure_ascii=False)
-                    journal.write(line.encode() + b"\n")
-                    journal.flush()
-                    results[key] = row
-                    if progress is not None:
-                        progress(number, len(missing), row)
-            except LostError as exc:
-                lost = exc
-        rows = [_table_row(tasks[key], results[key]) for key in tasks if key in results]
-        statuses = _write_tables(rows, folder)
+    with locked(folder / _JOURNAL, DataError):
+        agree = _options_agree(definition, redo)
+        with closing(Journal(folder / _JOURNAL)) as journal:
+            limits = Limits(timeout, memory, journal.seconds)
+            tasks = _by_key(definition)
+            before = _before(definition, tasks, journal.places)
+            missing = [key for key in tasks if key not in journal.places]
+            work = ((key, _job(definition, tasks[key], send_files, laws)) for key in missing)
+            if scheduler is not None:
+                place: Place = Scheduler(scheduler, workers)
+            elif executor is not None:
+                place = Place(workers or default_workers(), executor)
+            else:
+                place = Local(workers or default_workers())
+            with closing(place):
+                done = run_jobs(work, place, limits, patience)
+                if not agree:
+                    done = _unless_refused(done, min(_TRIAL_FITS, len(missing)), definition.source)
+                try:
+                    for number, (key, row) in enumerate(done, start=1):
+                        if not agree:
+                            write_whole(
+                                folder / "options.json", _options(definition), overwrite=True
+                            )
+                            agree = True
+                        journal.add(key, row)
+                        if progress is not None:
+                            progress(number, len(missing), row)
+                except LostError as exc:
+                    lost = exc
+            available = [key for key in tasks if key in journal.places]
+            rows = zip(available, journal.rows(available), strict=True)
+            statuses = write_tables((_table_row(tasks[key], row) for key, row in rows), folder)
     if lost is not None:
         raise DataError(
-            f"{lost}; {len(rows)} of {len(tasks)} fits are in {folder / 'results.csv'}, and "
+            f"{lost}; {len(available)} of {len(tasks)} fits are in {folder / 'results.csv'}, and "
             "the same command does the others"
         ) from lost
     return replace(before, statuses=statuses)
@@ -338,48 +361,121 @@ def _before(definition: Definition, tasks: Mapping[str, Task], keys: Container[s
     return Campaign(definition.folder, finished, to_do, {})
 
 
-def _job(definition: Definition, task: Task, laws: tuple[str | LawFile, ...]) -> Job:
+def _job(
+    definition: Definition, task: Task, send_files: bool, laws: tuple[str | LawFile, ...]
+) -> Job:
+    contents: list[bytes | None] = [None] * len(task.files)
+    if send_files:
+        with suppress(OSError, DataError):  # the worker then says what is wrong with the path
+            contents = [regular(path).read_bytes() for path in task.files]
+    files = tuple(zip(map(str, task.files), contents, strict=True))
     report = str(definition.folder / "reports" / f"{task.name}.html")
     place = report if definition.reports else None
-    files = tuple(map(str, task.files))
     return Job(task.name, files, task.runs, definition.options, place, laws)
 
 
+def _options(definition: Definition) -> bytes:
+    content = {"version": __version__, **definition.options}
+    return json.dumps(content, indent=2, sort_keys=True).encode()
+
+
+def _options_agree(definition: Definition, redo: bool) -> bool:
+    """Return whether the folder holds results with these options; others need `redo`."""
+    path = definition.folder / "options.json"
+    if not path.exists():
+        return False
+    try:
+        before = dict(json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as exc:
+        raise DataError(f"{path}: cannot be read: {exc}") from exc
+    now = json.loads(_options(definition))
+    changed = [
+        f"{name} was {json.dumps(before.get(name))}, now {json.dumps(now.get(name))}"
+        for name in sorted({*before, *now})
+        if before.get(name) != now.get(name)
+    ]
+    if changed and not redo:
+        raise DataError(
+            f"{definition.source}: {'; '.join(changed)}, but {definition.folder} holds results of "
+            f"the former; give another folder, or repeat all of them with {argument('redo', True)}"
+        )
+    return not changed
+
+
 def _by_key(definition: Definition) -> dict[str, Task]:
-    """Return the tasks by their keys."""
+    """Return the tasks by their keys.
+
+    A file's digest is computed again only if its size or modification time differs from that stored
+    with the last digest.
+    """
+    cache_path = definition.folder / "digests.json"
+    try:
+        cache = json.loads(cache_path.read_bytes())
+    except (OSError, ValueError):
+        cache = {}
+    digests: dict[str, list[Any]] = {}
     tasks = {}
     for task in definition.tasks:
-        digests = []
+        file_digests = []
         for path in task.files:
             try:
-                digests.append(digest_of(path))
-            except DataError:
-                digests.append("unreadable")  # a row that says so, until it can be read
-        tasks[definition.key([task.name, *task.runs, *digests], __version__)] = task
+                state = path.stat()
+                entry = cache.get(str(path))
+                if entry is None or entry[:2] != [state.st_size, state.st_mtime_ns]:
+                    entry = [state.st_size, state.st_mtime_ns, digest_of(path)]
+                digests[str(path)] = entry
+            except (OSError, DataError):
+                entry = [0, 0, "unreadable"]  # a row that says so, until it can be read
+            file_digests.append(entry[2])
+        tasks[definition.key([task.name, *task.runs, *file_digests], __version__)] = task
+    if definition.folder.is_dir() and digests != cache:
+        write_whole(cache_path, json.dumps(digests).encode(), overwrite=True)
     return tasks
 
 
-def _opened(path: Path, end: int) -> IO[bytes]:
-    """Return the journal, open for writing after its last whole line, which ends at `end`."""
-    try:
-        file: IO[bytes] = path.open("r+b" if path.exists() else "w+b")
-        file.truncate(end)
-        file.seek(end)
-    except OSError as exc:
-        raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
-    return file
+class Journal:
+    """The journal of one campaign: positions of lines by key, and the seconds of each fit."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.places, self.seconds, end = read_journal(path)
+        try:
+            self._file: IO[bytes] = path.open("r+b" if path.exists() else "w+b")
+            self._file.truncate(end)
+            self._file.seek(end)
+        except OSError as exc:
+            raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+
+    def add(self, key: str, row: Mapping[str, Any]) -> None:
+        """Append one result, and pass it to the operating system."""
+        line = json.dumps({"key": key, **row}, ensure_ascii=False).encode() + b"\n"
+        self.places[key] = self._file.tell()
+        self._file.write(line)
+        self._file.flush()
+
+    def rows(self, keys: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Yield results by key, in the order asked for."""
+        with self._path.open("rb") as file:
+            for key in keys:
+                file.seek(self.places[key])
+                yield json.loads(file.readline())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
-def _read_journal(path: Path) -> tuple[dict[str, Row], int]:
-    """Return the finished rows by key, and the end of the last whole line.
+def read_journal(path: Path) -> tuple[dict[str, int], list[float], int]:
+    """Return the position of each finished key's line, seconds, and the end of the last line.
 
     A fit that may have failed because of something other than its device is not finished: a process
     or a worker that died, files that a worker cannot access, a limit of time or memory.
     """
-    rows: dict[str, Row] = {}
+    places: dict[str, int] = {}
+    seconds: list[float] = []
     end = 0
     if not path.exists():
-        return rows, end
+        return places, seconds, end
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
             if not line.endswith(b"\n"):
@@ -387,21 +483,25 @@ def _read_journal(path: Path) -> tuple[dict[str, Row], int]:
             try:
                 row = json.loads(line)
                 if not row.get("retry"):
-                    rows[row["key"]] = row
+                    places[row["key"]] = end
+                if row["status"] != "failed":
+                    seconds.append(float(row["seconds"]))
             except (ValueError, KeyError, AttributeError, TypeError):
                 raise DataError(
                     f"{path}: line {number} is not a result of a campaign; move the file away to "
                     "start again"
                 ) from None
             end += len(line)
-    return rows, end
+    return places, seconds, end
 
 
-def _write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, int]:
+def write_tables(rows: Iterable[Mapping[str, Any]], folder: Path) -> dict[str, int]:
     """Write ``results.csv`` and, with pyarrow, ``results.parquet``; return counts of statuses."""
     import pandas as pd
 
-    table = pd.DataFrame([{name: _plain(value) for name, value in row.items()} for row in rows])
+    flat = ({name: _plain(value) for name, value in row.items()} for row in rows)
+    blocks = iter(lambda: list(islice(flat, _ROWS_AT_ONCE)), [])
+    table = pd.concat([pd.DataFrame(), *map(pd.DataFrame, blocks)], ignore_index=True)
     first = [name for name in _FIRST_COLUMNS if name in table]
     table = table[[*first, *sorted(map(str, set(table) - set(first)))]]
     is_number = pd.api.types.is_numeric_dtype

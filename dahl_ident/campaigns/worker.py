@@ -25,6 +25,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.errors import DataError, ModelError, ValidationError
@@ -46,7 +47,8 @@ class Job:
     """What a process needs to do one fit; plain data."""
 
     name: str  # device and run
-    files: tuple[str, ...]  # paths
+    # paths, with the contents if these are sent with the job
+    files: tuple[tuple[str, bytes | None], ...]
     runs: tuple[str, ...]  # label of each file
     options: Mapping[str, Any]  # of :class:`dahl_ident.campaigns.definition.Definition`
     report: str | None  # path of its report
@@ -83,7 +85,11 @@ def do(job: Job) -> Row:
                 laws_of(law)
         row = _fitted(job, digests)
     except UnseenError as exc:
-        row = failed(f"{exc}", retry=True)
+        row = failed(
+            f"{exc}; where workers do not have the files, send them with send_files=True (on the "
+            "command line --send-files)",
+            retry=True,
+        )
     except MemoryError as exc:
         row = failed(
             f"the limit of memory for a device does not suffice ({' '.join(str(exc).split())}); "
@@ -102,9 +108,8 @@ def _fitted(job: Job, digests: list[str]) -> Row:
     from dahl_ident.results import fit, posterior
 
     options = job.options
-    paths = [Path(file) for file in job.files]
-    digests += map(digest_of, paths)
-    data = _response(paths, job.runs, options)
+    with _on_disk(job, digests) as paths:
+        data = _response(paths, job.runs, options)
     model = model_from_description(options["model"])
     result = fit(data, model, throw=False, **options["fit"])
     row = _row(result)
@@ -138,6 +143,25 @@ def _response(
         run: read_record(path, **options["read"]) for run, path in zip(runs, paths, strict=True)
     }
     return extract(records, **options["extract"])
+
+
+@contextmanager
+def _on_disk(job: Job, digests: list[str]) -> Iterator[list[Path]]:
+    """Yield the paths of the files, and append their digests to a list.
+
+    Files that were sent with the job are in a folder that is removed afterwards.
+    """
+    with TemporaryDirectory(prefix="campaign_") as folder:
+        paths = []
+        for index, (name, content) in enumerate(job.files):
+            path = Path(name)
+            if content is not None:
+                path = Path(folder) / str(index) / path.name
+                path.parent.mkdir()
+                path.write_bytes(content)
+            paths.append(path)
+            digests.append(digest_of(path))
+        yield paths
 
 
 def digest_of(path: Path) -> str:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import sys
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -210,6 +213,9 @@ def app(
     serve(folder, port=port, laws=tuple(laws.laws or ()), browser=browser)
 
 
+_LINE_INTERVAL = 60.0  # s between lines of progress if there is no terminal
+
+
 @dataclass(frozen=True)
 class Running:
     """How the fits are run; options of ``campaign``."""
@@ -217,9 +223,16 @@ class Running:
     panel: ClassVar[str | None] = None
     jobs: int | None = setting("Processes; by default as many as processors.")
     scheduler: str | None = setting("Address of a Dask scheduler, tls://host:port.")
-    timeout: float = setting("Longest time for a device.", 600.0, unit="s")
+    timeout: float | None = setting(
+        "Longest time for a device; by default 10 medians, at least 60 s.", unit="s"
+    )
     memory: float | None = setting("Most memory for a device, GB; by default a fair share.")
+    patience: float = setting("Longest time without an answer from the scheduler.", 120.0, unit="s")
+    send_files: bool = setting(
+        "Send workers the contents of files, not paths.", False, "--send-files"
+    )
     dry_run: bool = setting("List what would be done.", False, "--dry-run")
+    redo: bool = setting("Repeat all fits if options have changed.", False, "--redo")
 
 
 @dataclass(frozen=True)
@@ -290,10 +303,11 @@ def campaign(
     laws.run()
     reporting.check(read_definition(definition), overwrite=writing.overwrite)
     with console.busy("fits") as show:
+        update = show if sys.stderr.isatty() else _line_printer()
         # this command reports lost connections itself
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         result = run_campaign(
-            definition, progress=lambda done, total, _: show(done, total), **vars(running)
+            definition, progress=lambda done, total, _: update(done, total), **vars(running)
         )
     if reporting.report is not None and not running.dry_run:
         path = result.report(
@@ -318,3 +332,19 @@ def campaign(
     console.finish(
         running.dry_run or usable, f"no fit can be used; the table says why, such as {why}"
     )
+
+
+def _line_printer() -> Callable[[int, int], None]:
+    """Return a function that prints the progress at most once a minute, for logs."""
+    started = last_line = time.monotonic()
+
+    def update(done: int, total: int) -> None:
+        nonlocal last_line
+        now = time.monotonic()
+        if now - last_line >= _LINE_INTERVAL:
+            last_line = now
+            rate = done / (now - started)
+            left = (total - done) / rate / 60.0
+            console.note(f"{done} of {total} fits, {rate:.3g} a second, {left:.0f} minutes left")
+
+    return update
