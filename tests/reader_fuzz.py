@@ -7,8 +7,8 @@ without and with a warning, refused, crashed the reader (an error that is not th
 the end of its process), hung (10 s of processor time), took more than 2 GB, or were silently
 wrong. Some of the damage is to bytes: silently wrong is what has samples missing, added, changed
 or shifted in time, where the file shows it, and neither a warning nor a note says so. The rest is
-what happens in laboratories: another header in the middle, a block twice, holes, a sensor that
-sticks. There a fit judges: silently wrong is a usable fit with wrong values.
+what happens in laboratories: another header in the middle, a change of unit, a block twice, holes,
+a sensor that sticks. There a fit judges: silently wrong is a usable fit with wrong values.
 """
 
 from __future__ import annotations
@@ -254,13 +254,16 @@ def mutant(rng: np.random.Generator, content: bytes, text: bool) -> tuple[str, b
 
 def laboratory(rng: np.random.Generator, name: str) -> tuple[str, bytes]:
     """Return a file with damage as laboratories do it, and the kind of damage."""
-    kinds = ["hole", "stuck"] + ["block twice"] * (name != "tdms")
+    kinds = ["unit switch", "hole", "stuck"] + ["block twice"] * (name != "tdms")
     kind = str(rng.choice(kinds + ["second header"] * 3 * (name in _WITH_HEADERS)))
     columns = np.array([TIME, X, F])
     first = 1 if kind == "second header" else 8  # that show what the unit was
     a, length = int(rng.integers(first, N - first)), int(rng.integers(8, 32))
+    block = slice(a, a + length if rng.random() < 0.5 else N)
     row = int(rng.integers(1, 3))
-    if kind == "hole":
+    if kind == "unit switch":
+        columns[int(rng.integers(3)), block] *= float(rng.choice([1e3, 1e-3]))
+    elif kind == "hole":
         columns[[[row], [1, 2]][int(rng.integers(2))], a : a + length] = 0.0
     elif kind == "stuck":
         columns[row, a : a + length] = columns[row, a]
@@ -369,7 +372,7 @@ def _is_wrong(record: Record, name: str, kind: str) -> bool:
     return not all(np.allclose(found, good, rtol=1e-5, atol=1e-9) for found, good in pairs)
 
 
-LABORATORY = ("hole", "stuck", "block twice", "second header")
+LABORATORY = ("unit switch", "hole", "stuck", "block twice", "second header")
 
 
 def _misleads(record: Record) -> bool:

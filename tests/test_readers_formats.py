@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 from scipy.io import savemat
 
-from dahl_ident.data import inspect, read_frequency_response, read_record
+from dahl_ident.data import Record, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, MissingDependencyError, UnitError
 
 pytestmark = pytest.mark.versions
@@ -472,6 +472,15 @@ class TestDictionaries:
         np.save(tmp_path / "run.npy", rows)
         names = {"time": "t [s]", "displacement": "x [m]", "force": "F [N]"}
         assert_the_run(read_record(tmp_path / "run.npy", columns=names))
+
+    def test_sdypy_there_and_back(self):
+        record = Record(TIME, displacement=X, force=F)
+        assert_the_run(read_record(record.to_sdypy()))
+        uneven = Record(TIME**2 + 1.0, velocity=X, drive=F)
+        back = read_record(uneven.to_sdypy())
+        np.testing.assert_array_equal(back.time, uneven.time)
+        np.testing.assert_array_equal(back.velocity, X)
+        assert back.drive_unit == "V"
 
     @pytest.mark.parametrize(
         ("change", "message"),

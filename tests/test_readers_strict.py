@@ -248,6 +248,57 @@ class TestDoubts:
             record = read_record(place(folder, "run.csv", csv(columns)))
         assert re.search(message, (record.provenance or {})["warnings"][0])
 
+    @pytest.mark.parametrize(("rows", "message"), [
+        ([1], "the motion repeats one value while the force goes on, from line 32"),
+        ([2], "the force repeats one value while the motion goes on, from line 32"),
+        ([1, 2], "motion and force are 0 for a while, from line 32"),
+    ])  # fmt: skip
+    def test_holes(self, rows, message, tmp_path):
+        columns = COLUMNS.copy()
+        columns[rows, 30:45] = 0.0
+        self.named(tmp_path, columns, message)
+
+    @pytest.mark.parametrize("places", [slice(30, 45), slice(None)])
+    def test_a_motion_that_sticks(self, places, tmp_path):
+        columns = COLUMNS.copy()
+        columns[1, places] = columns[1, 30]
+        self.named(tmp_path, columns, "the motion repeats one value while the force goes on")
+
+    @pytest.mark.parametrize("row", [0, 1, 2])
+    @pytest.mark.parametrize("factor", [1e3, 1e-3])
+    def test_a_unit_that_switches(self, row, factor, tmp_path):
+        columns = COLUMNS.copy()
+        columns[row, 30:] *= factor
+        if row == 0:
+            columns[0, 30:] = columns[0, 29] + (TIME[30:] - TIME[29]) * factor
+        self.named(tmp_path, columns, r"1000 times larger or smaller from line (30|31|32) \(1 ")
+
+    @pytest.mark.parametrize("row", [1, 2])
+    @pytest.mark.parametrize("factor", [1e3, 1e-3])
+    def test_a_unit_that_switches_anywhere(self, row, factor, tmp_path):
+        t = np.arange(200) / 200.0
+        x = 1e-3 * (0.7 + t) * np.sin(6 * np.pi * t + 0.1)
+        columns = np.array([t, x, DAHL.force(x)])
+        columns[1:] += [[1e-7], [2e-3]] * np.random.default_rng(3).standard_normal((2, t.size))
+        named = 0
+        for at in range(10, 190, 3):
+            changed = columns.copy()
+            changed[row, at:] *= factor
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                read_record(place(tmp_path, "run.csv", csv(changed)))
+            named += any("1000 times larger or smaller" in str(w.message) for w in said)
+        assert named >= 42  # of 60; where a signal passes zero it is too small to tell
+
+    def test_good_records_raise_none(self, tmp_path):
+        t = np.arange(4000) / 100.0
+        level = np.repeat([1e-5, 1e-2, 2e-3, 0.0], 1000)
+        x = level * np.sin(2.0 * np.pi * t)
+        for law in (di.Dahl(0.1, 30.0), di.Backlash(di.Dahl(0.1, 30.0), 1e-3)):
+            for noise in (0.0, 1e-6):
+                force = law.force(x) + noise * np.random.default_rng(0).standard_normal(t.size)
+                assert read_record(place(tmp_path, "run.csv", csv([t, x, force]))).n == t.size
+
     def test_channels_that_start_apart_or_together(self, tmp_path):
         nptdms: Any = importlib.import_module("nptdms")
         start = np.datetime64("2026-03-01T12:00:00")

@@ -296,6 +296,26 @@ class TestUnusualTables:
         with pytest.warns(DataWarning, match="read as 2 runs"):
             assert read_frequency_response(written(tmp_path, units + units)).runs == ["1", "2"]
 
+    def test_a_converter_that_sticks(self, tmp_path):
+        t = np.arange(400) / 100.0
+        x, force = np.sin(2 * np.pi * t), np.cos(2 * np.pi * t)
+
+        def text(values):
+            rows = (f"{a!r},{b!r},{c!r}" for a, b, c in np.column_stack([t, x, values]).tolist())
+            return "time [s],x [mm],F [N]\n" + "\n".join(rows) + "\n"
+
+        for good in (force, np.sign(force), np.clip(3.0 * force, -1.0, 1.0), np.round(force, 1)):
+            assert read_record(written(tmp_path, text(good))).n == 400
+        force[115:135] = force[115]
+        with pytest.warns(DataWarning, match=r"goes on, from line 117 \(1 such places\)"):
+            record = read_record(written(tmp_path, text(force)))
+        assert "the force repeats one value" in repr(record)
+        noisy = np.cos(2 * np.pi * t) + 0.05 * np.random.default_rng(0).standard_normal(t.size)
+        for place in (110, 250, 390):
+            noisy[place : place + 10] = noisy[place]
+        with pytest.warns(DataWarning, match=r"goes on, from line 112 \(3 such places\)"):
+            read_record(written(tmp_path, text(noisy)))
+
     def test_a_line_of_brackets_ends(self, tmp_path):
         for text in ("[" * 200_000, "(" * 200_000, "x" + " " * 200_000 + "["):
             for table in (f"{text}\n0 1\n1 2\n", f"{text},b\n0,1\n1,2\n"):

@@ -58,6 +58,14 @@ def record(folder, change):
     return path
 
 
+def stuck(folder):
+    def change(force):
+        for start in (720, 2220, 3720, 5220):
+            force[start : start + 25] = force[start]
+
+    return di.extract(record(folder, change), harmonics=[1])
+
+
 def marks(folder):
     def change(force):
         force[[100, 101, 3000]] = -9999.0
@@ -72,6 +80,7 @@ def marks(folder):
         (one_sign, "the phase's sign creates energy: line 5"),
         (rms_drive, "drive and amplitude do not agree with the response by more than 10 %"),
         (two_days, "the header is repeated in the file: read as 2 runs"),
+        (stuck, "does a converter stick?"),
         (marks, "3 samples left out: column 'F' is -9999 in them, a mark of a missing value"),
     ],
 )

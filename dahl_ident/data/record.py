@@ -243,6 +243,31 @@ class Record(Tabular):
         units = {"time": "s", **units, "drive": self.drive_unit}
         return {name: unit for name, unit in units.items() if getattr(self, name) is not None}
 
+    def to_sdypy(self) -> list[dict[str, Any]]:
+        """Return the channels as SDyPy's time series (its enhancement proposal 5).
+
+        Returns
+        -------
+        list of dict
+            ``name``, ``data``, ``unit_str`` and ``time`` of each channel, and ``fs`` if the samples
+            are evenly spaced and begin at zero. :func:`~dahl_ident.read_record` reads the list.
+
+        Examples
+        --------
+        >>> record = Record([0.0, 0.1], displacement=[0.0, 1.0], force=[0.0, 2.0])
+        >>> [(c["name"], c["unit_str"]) for c in record.to_sdypy()]
+        [('displacement', 'm'), ('force', 'N')]
+        """
+        sampling: dict[str, Any] = {"time": self.time}
+        if self.uniform and self.time[0] == 0.0:
+            sampling["fs"] = self.sample_rate
+        units = self._units
+        del units["time"]
+        return [
+            {"name": name, "data": getattr(self, name), "unit_str": unit, **sampling}
+            for name, unit in units.items()
+        ]
+
     def to_frame(self) -> pd.DataFrame:
         """Return a pandas table with one row for each sample and units in the headers.
 

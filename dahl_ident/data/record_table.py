@@ -10,6 +10,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.column_map import Binding, ColumnMap, proposal, scaled
 from dahl_ident.data.columns import RECORD_COLUMNS
+from dahl_ident.data.plausibility import record_warnings
 from dahl_ident.data.raw_columns import RawChannel, RawFile, missing_marks
 from dahl_ident.data.record import Record, is_even
 from dahl_ident.data.tabular import listed
@@ -67,6 +68,12 @@ def record_from(
         assert rate is not None  # otherwise _channels requires a time column
         bound.notes.append(f"time counted from the sample rate of {rate:g} Hz")
         values["time"] = (np.arange(size) / rate)[complete]
+    force: FloatArray = values["force"] if "force" in values else values["drive"]
+    motion = next(values[kind] for kind in MOTION_KINDS if kind in values)
+    for samples, message in record_warnings(values["time"], motion, force):
+        if samples.size:
+            first = bound.source.row_name(int(samples[0]))
+            bound.warn(message.format(f"{first} ({samples.size} such places)"))
     try:
         return Record(**values, motion=bound.motion(), provenance=bound.provenance())
     except ValidationError as exc:
