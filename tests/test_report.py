@@ -85,7 +85,7 @@ def test_html_tells_the_numbers_side_by_side(page_file, fit):
         assert method in text
     assert f'data-value="{fit.params["f_max"].value}"' in text
     software = f"dahl_ident {di.__version__}, python"
-    for fact in ("ab" * 32, software, "Seed 3", "Zero to peak"):
+    for fact in ("ab" * 32, software, "Seed 3", "dahl-ident fit", "Zero to peak"):
         assert fact in text
 
 
@@ -277,6 +277,7 @@ def test_provenance_of_several_files_is_listed(fit, tmp_path):
     assert [(one["file"], one["sha256"]) for one in told["files"]] == [
         ("run0.csv", "0" * 64), ("run1.csv", "1" * 64)
     ]  # fmt: skip
+    assert "run0.csv run1.csv" in told["command"]
 
 
 @pytest.mark.pictures

@@ -328,9 +328,22 @@ def test_the_page_on_a4(fit, microslip, tmp_path):
             assert all("frequency [Hz]" in t for t in rows), "the heading is repeated"
 
 
-def test_pdf_is_signed_on_its_first_pages(fit, tmp_path):
+def test_pdf_marks_its_headings_for_reading_aloud(fit, tmp_path):
     pypdf = pytest.importorskip("pypdf")
     reader = pypdf.PdfReader(report(fit, tmp_path / "r.pdf"))
+    tree = reader.trailer["/Root"]["/StructTreeRoot"]["/K"][0].get_object()["/K"]
+    elements = [element.get_object() for element in tree]
+    tags = [element["/S"] for element in elements]
+    for table in (element for element in elements if element["/S"] == "/Table"):
+        lines = [row.get_object()["/K"] for row in table["/K"]]
+        kinds = [[cell.get_object()["/S"] for cell in line] for line in lines]
+        assert set(kinds[0]) == {"/TH"}
+        assert {kind for row in kinds[1:] for kind in row} == {"/TD"}
+        assert {len(row) for row in kinds} == {len(kinds[0])}
+    assert tags.count("/Table") >= 4
+    assert tags.count("/H1") == 1
+    assert tags.count("/H2") >= 6
+    assert tags.count("/Figure") >= 5
     front = [page.extract_text() for page in reader.pages]
     (signed,) = (i for i, text in enumerate(front) if "Signature" in text)
     assert signed <= 1

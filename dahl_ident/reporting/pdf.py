@@ -6,21 +6,28 @@ The fonts are the DejaVu fonts shipped with matplotlib, which have Greek letters
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from fpdf import FPDF
+from fpdf import table as fpdf_table
 from fpdf.fonts import FontFace
+from fpdf.structure_tree import StructElem, StructureTreeBuilder
+from fpdf.syntax import Name, PDFArray, PDFObject
 
 from dahl_ident.reporting.document import (
     Block,
     Bullets,
+    Cell,
     Document,
     Listing,
     Paragraph,
     Picture,
+    Section,
     TextTable,
     words,
 )
@@ -31,6 +38,7 @@ _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Obl
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _KEPT_HEIGHT = 10.0, 28.0  # mm; of a heading, and of the text kept below it
 _LONGEST_TITLE = 60  # letters at the foot of a page
+_WHOLE = 20.0  # mm; paragraphs up to this height are not divided between pages
 _MARGIN = 16.0  # mm, of the pages
 _SIGNATURE = 26.0  # mm, height of the fields for date and signature
 _WIDEST_COLUMN = 75.0  # mm, largest width of a column of a table
@@ -58,25 +66,33 @@ def pdf(document: Document) -> bytes:
     for line in document.verdict:
         _text(page, line)
     _header(page, document)
-    front = [section for section in document.sections if not section.details]
-    for i, section in enumerate(document.sections):
-        last = i == len(front) - 1 < len(document.sections) - 1
-        page.set_auto_page_break(True, _MARGIN + _SIGNATURE * last)  # not alone on a page
-        if i == len(front):
+    before: Section | None = None
+    for section, after in zip_longest(document.sections, document.sections[1:]):
+        signed = not section.details and after is not None and after.details
+        page.set_auto_page_break(True, _MARGIN + _SIGNATURE * signed)  # not alone on a page
+        if section.details and not (before and before.details):
             _signature(page, document.signatory)
             page.add_page()
+        before = section
         pictures = [_Drawn(block) for block in section.blocks if isinstance(block, Picture)]
+        if not section.blocks:
+            continue
         page.ln(3)
-        only_pictures = len(pictures) == len(section.blocks)
-        below = _row_height(pictures[:2]) if only_pictures else _KEPT_HEIGHT
+        match section.blocks[0]:
+            case Picture():
+                below = _row_height(pictures[:2])
+            case TextTable() as table:
+                below = _beginning(page, table, _widths(page, table))
+            case _:
+                below = _KEPT_HEIGHT
         _keep_together(page, _HEADING_HEIGHT + below)
         page.start_section(section.title)
         _heading(page, section.title, 2)
         for block in section.blocks:
             if not isinstance(block, Picture):
                 _block(page, block)
-        for k in range(0, len(pictures), 2):
-            _pictures(page, pictures[k : k + 2])
+        for i in range(0, len(pictures), 2):
+            _pictures(page, pictures[i : i + 2])
     return bytes(page.output())
 
 
@@ -102,6 +118,7 @@ def _page(document: Document) -> FPDF:
             self.cell(0, 4, f"Page {self.page_no()} of {{nb}}", align="R")
 
     page = Page(format="A4")
+    page.struct_builder = _Structure()
     page.set_margins(_MARGIN, _MARGIN, _MARGIN)
     page.set_auto_page_break(True, _MARGIN)
     page.set_title(document.title)
@@ -113,8 +130,13 @@ def _page(document: Document) -> FPDF:
 
 
 def _heading(page: FPDF, text: str, level: int) -> None:
+    """Print a heading, tagged for screen readers."""
     page.set_font(_FONT, "B", 17 if level == 1 else 12)
-    page.multi_cell(0, 8 if level == 1 else 6, text, new_x="LMARGIN", new_y="NEXT")
+    height = 8 if level == 1 else 6
+    _keep_together(page, 3.0 * height)  # a marked sequence must not cross pages
+    with page._marked_sequence(title=text) as element:  # the only way in fpdf2
+        element.s = Name(f"H{level}")
+        page.multi_cell(0, height, text, new_x="LMARGIN", new_y="NEXT")
 
 
 def _header(page: FPDF, document: Document) -> None:
@@ -165,6 +187,11 @@ def _block(page: FPDF, block: Block) -> None:
 
 
 def _text(page: FPDF, text: str) -> None:
+    """Print a paragraph; a short one is not divided between pages."""
+    height = page.multi_cell(0, 5, text, align="L", dry_run=True, output="HEIGHT")
+    assert isinstance(height, float | int)
+    if height <= _WHOLE:
+        _keep_together(page, height)
     page.multi_cell(0, 5, text, align="L", new_x="LMARGIN", new_y="NEXT")
     page.ln(1)
 
@@ -207,22 +234,96 @@ def _keep_together(page: FPDF, height: float) -> None:
 
 def _table(page: FPDF, table: TextTable) -> None:
     widths = _widths(page, table)
-    _keep_together(page, _KEPT_HEIGHT)
+    _keep_together(page, _beginning(page, table, widths))
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)
-    with page.table(
-        col_widths=tuple(widths),
+    drawn = _TaggedTable(
+        page,
+        col_widths=widths,
         text_align="LEFT",
         line_height=4,
         padding=0.5,
         borders_layout="HORIZONTAL_LINES",
-    ) as drawn:
-        for row in (words(*table.header), *table.rows):
-            line = drawn.row()
-            for cell in row:
-                line.cell(cell.text, style=_STRUCK if cell.struck else None)
+    )
+    for row in (words(*table.header), *table.rows):
+        line = drawn.row()
+        for cell in row:
+            line.cell(cell.text, style=_STRUCK if cell.struck else None)
+    drawn.render()
     page.ln(2)
+
+
+class _TaggedTable(fpdf_table.Table):
+    """A table whose cells are tagged for screen readers."""
+
+    def render(self) -> None:
+        self._marked: set[tuple[int, int]] = set()
+        structure = self._fpdf.struct_builder
+        assert isinstance(structure, _Structure)
+        self._structure = structure
+        self._structure.tables.append([[] for _ in self.rows])
+        super().render()
+
+    def _render_table_cell(
+        self, i: int, j: int, cell: Any, row_height: float, *args: Any, **kwargs: Any
+    ) -> Any:
+        draw = super()._render_table_cell
+        measured_only = kwargs.get("cell_height_info") is None
+        if measured_only or (i, j) in self._marked:  # headings are repeated on the next page
+            return draw(i, j, cell, row_height, *args, **kwargs)
+        self._marked.add((i, j))
+        with self._fpdf._marked_sequence() as element:
+            element.s = Name("TD" if i else "TH")
+            self._structure.tables[-1][i].append(element)
+            return draw(i, j, cell, row_height, *args, **kwargs)
+
+
+class _Structure(StructureTreeBuilder):
+    """The tags of the pages, with cells in rows and rows in tables; fpdf2 has a flat list."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tables: list[list[list[StructElem]]] = []
+
+    def __iter__(self) -> Iterator[PDFObject]:
+        document = StructElem("/Document", self.struct_tree_root, [])
+        self.struct_tree_root.k = PDFArray([document])
+        groups, first, inside = [document], {}, set()
+        for rows in self.tables:
+            table = StructElem("/Table", document, [])
+            groups.append(table)
+            first[id(rows[0][0])] = table
+            for cells in rows:
+                row = StructElem("/TR", table, [])
+                groups.append(row)
+                table.k.append(row)
+                for cell in cells:
+                    inside.add(id(cell))
+                    cell.p = row
+                    row.k.append(cell)
+        for element in self.doc_struct_elem.k:
+            if id(element) in first:
+                document.k.append(first[id(element)])
+            if id(element) not in inside:
+                element.p = document
+                document.k.append(element)
+        yield from (self.struct_tree_root, *groups, self.struct_tree_root.parent_tree)
+        yield from self.doc_struct_elem.k
+
+
+def _beginning(page: FPDF, table: TextTable, widths: Sequence[float]) -> float:
+    """Return the height of a table's caption, header and first row, which stay together."""
+    rows = (words(*table.header), *table.rows[:1])
+    return _CAPTION_HEIGHT + sum(_height(page, row, widths) for row in rows)
+
+
+def _height(page: FPDF, row: Sequence[Cell], widths: Sequence[float]) -> float:
+    """Return the approximate height of a row with wrapped texts."""
+    page.set_font(_FONT, "B", 7.5)
+    inner = (page.epw * width / sum(widths) - _PADDING for width in widths)
+    lines = (page.get_string_width(c.text) / width for c, width in zip(row, inner, strict=True))
+    return 4.0 * (1 + int(max(lines))) + 1.0
 
 
 def _widths(page: FPDF, table: TextTable) -> list[float]:

@@ -55,7 +55,7 @@ def report(
     title : str, optional
         First line; by default the file's name.
     command : str, optional
-        The command that reproduces the report, for its section on the origin.
+        The command that reproduces the report; by default the one that fits the same model.
     record : Record, optional
         The waveforms from which the data were extracted; the report shows how a point settled.
     metadata : mapping or path of a TOML file, optional

@@ -75,7 +75,9 @@ def document(
         content = _of_several_tables(results, known)
     else:
         content = _of_one_table(tables_first, known, record)
-        origin = tuple(_origin(tables_first, command))
+        typed = command is not None
+        command = command or provenance.equivalent_command(results)
+        origin = tuple(_origin(tables_first, command, typed=typed))
         sections = (*content.sections, Section("Origin", origin, details=True))
         content = replace(content, sections=sections)
     files = _files(tables_first)
@@ -363,7 +365,7 @@ def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Sect
     )
 
 
-def _origin(results: Sequence[Result], command: str | None) -> Iterator[Block]:
+def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> Iterator[Block]:
     if files := _files(results):
         rows = tuple(
             words(s.file, "read" if s.read else "origin of the file above", s.sha256) for s in files
@@ -377,10 +379,14 @@ def _origin(results: Sequence[Result], command: str | None) -> Iterator[Block]:
     yield Paragraph(f"Versions: {versions}.")
     when = f"Made on {provenance.today()}"
     if command is None:
-        yield Paragraph(f"{when}, in Python.")
-    else:
+        yield Paragraph(f"{when}, in Python; no command describes this model and these data.")
+        return
+    if typed:
         yield Paragraph(f"{when}. This command reproduces it:")
-        yield Listing(command)
+    else:
+        how = "With all rows of the files, this command gives the same result:"
+        yield Paragraph(f"{when}, in Python. {how}")
+    yield Listing(command)
 
 
 def _fit_facts(fit: FitResult) -> dict[str, Any]:
