@@ -142,6 +142,23 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path, command):
     assert (ended.returncode, ended.stderr) == (1, b"")
 
 
+@POSIX
+@pytest.mark.parametrize(
+    ("command", "status", "says"),
+    [
+        ("datasets >&-", 1, b"error: standard output is closed; send it to a file, or /dev/null\n"),
+        ("datasets noisy -o n.csv >&- 2>&-", 1, b""),
+        ("fit - <&-", 1, b"error: standard input: the file is empty\n"),
+        ("datasets noisy -o n.csv 2>&-", 0, b""),
+    ],
+)
+def test_closed_streams(tmp_path, command, status, says):
+    words = ["sh", "-c", f"exec {PROGRAM} {command}"]
+    ended = subprocess.run(words, stderr=subprocess.PIPE, cwd=tmp_path)
+    assert (ended.returncode, ended.stderr) == (status, says)
+    assert list(tmp_path.iterdir()) == ([] if status else [tmp_path / "n.csv"])
+
+
 def test_of_two_writers_one_fails(tmp_path, monkeypatch):
     place, other = tmp_path / "t.csv", b"of somebody else"
     written = Path.write_bytes

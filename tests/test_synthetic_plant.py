@@ -34,11 +34,14 @@ def phasor(signal, frequency_hz, start, periods, k=1):
 @pytest.mark.parametrize(
     "plant",
     [
+        Dahl(*FRICTION) + Damper(0.5),
+        Dahl(*FRICTION) + Spring(3.0),
+        Dahl(*FRICTION) + Spring(3.0) + Damper(0.1),
         Dahl(*FRICTION) + Mass(0.3),
         Dahl(*FRICTION, 0.25) + LINEAR,
         Dahl(*FRICTION, 3.0) + LINEAR,
     ],
-    ids=["mass", "alpha 1/4", "alpha 3"],
+    ids=["damper", "spring", "spring and damper", "mass", "alpha 1/4", "alpha 3"],
 )
 @pytest.mark.parametrize("level", [0.05, 0.5])
 def test_forces_balance_at_every_instant(plant, level):
@@ -53,6 +56,17 @@ def test_forces_balance_at_every_instant(plant, level):
     misfit = np.abs(total - force.value(time))[2:-2]
     assert np.quantile(misfit, 0.99) < 2e-4 * level
     assert np.max(misfit) < 5e-3 * level
+
+
+@pytest.mark.parametrize("plant", [Spring(3.0), Spring(3.0) + Damper(0.1)])
+@pytest.mark.parametrize("law", [Dahl(*FRICTION), BoucWen(30.0, 200.0, 100.0)])
+def test_a_plant_without_mass_follows_a_jump_of_the_force(law, plant):
+    sweep = FrequencySweep((0.05, 0.3), 1.0, 1.37, 2.3, ramp_periods=0.0)
+    force = sweep.waveform(seed=0)
+    time = np.linspace(0.0, force.duration, 20_001)
+    x = displacement_under(law + plant, force)(time)
+    total = (law + plant).force(x, velocity=np.gradient(x, time))
+    assert np.quantile(np.abs(total - force.value(time)), 0.99) < 1e-4
 
 
 @pytest.mark.parametrize("controlled", ["force", "displacement"])
@@ -138,7 +152,7 @@ def test_progress_rises_to_one():
 @pytest.mark.parametrize(
     ("plant", "message"),
     [
-        (Dahl(*FRICTION), "has no mass"),
+        (Dahl(*FRICTION), "friction alone slides without bound"),
         (Dahl(0.1) + Mass(0.3), "no value for sigma"),
         (
             Dahl(*FRICTION) + LinearSystem(
@@ -146,8 +160,13 @@ def test_progress_rises_to_one():
             ),
             "no equation of motion in continuous time",
         ),
+        (
+            Dahl(*FRICTION) + LinearSystem(control.tf([1.0], [1.0, 1.0, 1.0, 1.0, 1.0]),
+            quantity="dynamic_stiffness"),
+            "has no state-space form; give the plant a mass",
+        ),
     ],
-    ids=["no linear part", "no value", "frequency response data"],
+    ids=["no linear part", "no value", "frequency response data", "improper"],
 )  # fmt: skip
 def test_a_plant_without_motion_says_why(plant, message):
     wave = SteppedSine((0.1,), controlled="force").waveform(seed=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import json
+import math
 import secrets
 import shlex
 import subprocess
@@ -323,10 +324,12 @@ class App:
     async def state(self, request: Request) -> Response:
         """Return the progress of a run, for the page's script."""
         _, folder = self._run(request)
-        job = self.jobs.state(folder)
+        job, left = self.jobs.state(folder), ""
+        if job["left"] is not None:
+            left = f", about {math.ceil(job['left'])} s left"
         title = job["steps"][min(job["step"], len(job["steps"]) - 1)]["title"]
         at = f"step {job['step'] + 1} of {len(job['steps'])}"
-        text = f"{title}: {at}, {job['seconds']:.0f} s"
+        text = f"{title}: {at}, {job['seconds']:.0f} s{left}"
         return JSONResponse({"busy": self.jobs.is_running(folder), "text": text})
 
     async def act(self, request: Request) -> Response:

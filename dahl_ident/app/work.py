@@ -157,6 +157,7 @@ class Jobs:
         self._children: dict[Path, subprocess.Popen[bytes]] = {}
         self._running: dict[Path, dict[str, Any]] = {}
         self._lock = threading.Lock()
+        self._seconds: dict[tuple[str, ...], float] = {}
 
     def start(self, folder: Path, steps: Sequence[JobStep], directory: Path) -> None:
         """Start the commands of a job in a directory; their output is written to a folder."""
@@ -174,7 +175,7 @@ class Jobs:
 
     def _run(self, folder: Path, job: dict[str, Any], directory: Path) -> None:
         for number, step in enumerate(job["steps"]):
-            job["step"] = number
+            job["step"], job["step_began"] = number, time.time()
             output, errors = (folder / f"{number}.{kind}" for kind in ("out", "err"))
             with output.open("wb") as out, errors.open("wb") as err:
                 with self._lock:
@@ -194,6 +195,7 @@ class Jobs:
             if status not in _SUCCESS:
                 job["status"], job["error"] = _FAILED, _text(errors)
                 break
+            self._seconds[_timing_key(step)] = time.time() - job["step_began"]
         else:
             job["status"] = _ENDED
         job["seconds"] = time.time() - job["began"]
@@ -223,12 +225,27 @@ class Jobs:
             job = json.loads((folder / "job.json").read_text("utf-8"))
             if job["status"] == _RUNNING:
                 job |= {"status": _CANCELLED, "error": "The server was stopped meanwhile."}
-            return dict(job)
-        return {**job, "seconds": time.time() - job["began"]}
+            return {**job, "left": None}
+        return {**job, "seconds": time.time() - job["began"], "left": self._remaining_time(job)}
+
+    def _remaining_time(self, job: dict[str, Any]) -> float | None:
+        """Return the remaining time if the steps take as long as before; None if one is new."""
+        remaining: float = job.get("step_began", job["began"]) - time.time()
+        for step in job["steps"][job["step"] :]:
+            if (key := _timing_key(step)) not in self._seconds:
+                return None
+            remaining += self._seconds[key]
+        return max(0.0, remaining)
 
     def is_running(self, folder: Path) -> bool:
         """Return whether a job is running in a folder, or in one below it."""
         return any(folder == one or folder in one.parents for one in list(self._running))
+
+
+def _timing_key(step: dict[str, Any]) -> tuple[str, ...]:
+    """Return command and files of a step: steps with the same take about the same time."""
+    words = [word for word in step["words"] if not word.startswith("run-")]
+    return tuple(words[: words.index("--element")] if "--element" in words else words)
 
 
 def output(folder: Path, number: int) -> str:

@@ -79,6 +79,9 @@ def main(arguments: list[str] | None = None) -> None:
     typed = sys.argv[1:] if arguments is None else arguments
     # the matrices are small: numerical threads would spend more time waiting than computing
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if not console.open_streams():
+        console.write_error("error: standard output is closed; send it to a file, or /dev/null")
+        sys.exit(console.BAD_INPUT)
     console.begin(typed)
     try:
         try:

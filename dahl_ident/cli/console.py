@@ -65,6 +65,19 @@ def begin(typed: Sequence[str]) -> None:
     setattr(warnings, "showwarning", show)  # noqa: B010 - an assignment fails the type check
 
 
+def open_streams() -> bool:
+    """Connect closed standard streams to the null device; return whether output was open.
+
+    Otherwise what libraries print would go into the next file that is opened.
+    """
+    output_is_open = sys.stdout is not None
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            null = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 - open to the end
+            setattr(sys, name, null)
+    return output_is_open
+
+
 def option_name(name: str) -> str:
     """Return the command-line option for an argument."""
     return f"--{name.replace('_', '-')}"
