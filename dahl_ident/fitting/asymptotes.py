@@ -21,6 +21,10 @@ A limit is therefore searched as a separate problem, in a **chart**: coordinates
 finite, mapped to a theta so far out that the model agrees with its limit to five digits or more
 (three for no full slip). If the sum of squares there is not higher than at any finite optimum, the
 limit is the optimum, and phi gives the determined quantities and their covariance.
+
+In microslip with a free spring the cost has a long curved valley even if its minimum is finite. The
+chart (kappa, x_c, sigma + stiffness) straightens it; if f_max is given, the chart
+(sigma, sigma + stiffness).
 """
 
 from __future__ import annotations
@@ -216,29 +220,32 @@ def _tying(element: Element) -> Asymptote | None:
     return next((a for a in asymptotes if a.adds_to_spring is not None), None)
 
 
-def microslip_charts(problem: TableProblem) -> list[Chart]:
+def microslip_charts(problem: TableProblem, *, scale_given: bool = False) -> list[Chart]:
     """Return the charts that straighten the valley of microslip: one per law and free spring.
 
-    With a free spring the cost has a long curved valley even if its minimum is finite. The
-    coordinates are the determined combination, the logarithm of the ratio that tends to infinity,
-    and the sum of sigma and the spring.
+    Their coordinates are the determined combination, the logarithm of the ratio that tends to
+    infinity, and the sum of sigma and the spring. With `scale_given`, the charts are those of laws
+    whose other scale parameter is given: ln sigma, and the sum.
     """
     charts = []
     for element in problem.model.elements:
         tying = _tying(element)
         if tying is None or tying.follows is None or tying.adds_to_spring is None:
             continue
-        pair = [element.parameter(label) for label in tying.follows[:2]]
-        if not all(p.free for p in pair) or len(tying.kept) != 1:
+        tied = element.parameter(tying.adds_to_spring)
+        both = [element.parameter(label) for label in tying.follows[:2]]
+        given = not all(p.free for p in both)
+        if not tied.free or given != scale_given or (not given and len(tying.kept) != 1):
             continue
         matrix = np.eye(len(problem.parameters))
-        at = [problem.names.index(p.name) for p in pair]
-        powers = _powers(element, tying.kept[0][1], problem)[at]
-        matrix[np.ix_(at, at)] = np.linalg.inv(np.array([[1.0, -1.0], powers]))
-        sigma = problem.names.index(element.parameter(tying.adds_to_spring).name)
+        if not given:
+            pair = [problem.names.index(p.name) for p in both]
+            powers = _powers(element, tying.kept[0][1], problem)[pair]
+            matrix[np.ix_(pair, pair)] = np.linalg.inv(np.array([[1.0, -1.0], powers]))
+        sigma = problem.names.index(tied.name)
         back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
         springs = (problem.names.index(p.name) for p in free_springs(problem))
-        charts += [Chart(matrix, np.zeros(len(matrix)), back, (i, sigma)) for i in springs]
+        charts += [Chart(matrix, np.zeros(len(matrix)), back, (at, sigma)) for at in springs]
     return charts
 
 

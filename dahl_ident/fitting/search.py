@@ -4,9 +4,10 @@
    values are one more.
 2. Levenberg and Marquardt's method from all of them together, exact Jacobian, search coordinates.
    With ``method="scipy"``, `scipy.optimize.least_squares` from each of the same starts; only
-   limits are searched as before.
-3. Where a table's search has not converged, or leaves friction badly determined, the limits at
-   infinity are searched as well (:mod:`dahl_ident.fitting.asymptotes`).
+   charts and limits are searched as before.
+3. Where a table's search has not converged, or leaves friction badly determined, the charts of
+   microslip and the limits at infinity are searched as well
+   (:mod:`dahl_ident.fitting.asymptotes`).
 4. Where a search has left the bounds, or nothing has converged, `scipy.optimize.least_squares`
    goes on from there.
 
@@ -27,7 +28,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray, finite_number
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
-from dahl_ident.fitting.asymptotes import Chart, Reach, limits
+from dahl_ident.fitting.asymptotes import Chart, Reach, limits, microslip_charts
 from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.global_start import Starts, edge_starts, global_starts, grid_size
 from dahl_ident.fitting.levenberg_marquardt import (
@@ -411,11 +412,18 @@ class TableSearch:
         end.assign(chosen, by_sine.take(chosen))
 
     def _look_wider(self, end: Minima, begin: Starts, scale: float) -> Minima:
-        """Return the best of `end`, of searches from further starts, and of the limits."""
+        """Return the best of `end`, of searches in microslip's charts, and of the limits."""
         problem, every = self.problem, np.arange(self.problem.n_tables)
         if self.starts_given:
             begin = begin.joined(global_starts(problem))
             end = end.better(self._descend(begin, scale))
+        begin = Starts(every, end.theta).joined(begin)
+        charts = microslip_charts(problem) + microslip_charts(problem, scale_given=True)
+        for chart in charts:
+            minima = self._descend(begin, scale, chart)
+            theta = chart.theta(minima.theta)
+            hessian = problem.quadratic(theta, scale, self.loss).hessian
+            end = end.better(replace(minima, theta=theta, hessian=hessian))
         faint = np.flatnonzero(~end.converged & self.reach(end.theta))
         if faint.size:
             part = self._of(faint)
