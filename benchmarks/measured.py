@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.jenkins_bound import least_misfit
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
+from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.fitting import solve
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
@@ -115,7 +115,7 @@ def beam() -> None:
     print("\n| levels | rows | any Masing law | Iwan | Dahl |\n|---|---|---|---|---|")
     for kind in ("Force", "Response"):
         data = table.select(level=[level for level in table.levels if level.startswith(kind)])
-        least = least_misfit(data, [di.Mass(), di.Damper()])
+        least = slip_density(data, di.Mass() + di.Damper()).least_misfit
         cells = [f"{100.0 * least:.1f} %"]
         for law in (di.Iwan(), di.Dahl()):
             found = solve(TableProblem(data, law + di.Mass() + di.Damper()))

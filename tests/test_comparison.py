@@ -62,6 +62,41 @@ def test_the_command_prints_the_comparison(run):
     assert "force limit" in result.out
 
 
+@pytest.mark.long
+def test_lugre_is_tried_where_the_force_falls_with_the_frequency():
+    A = np.tile(np.geomspace(1e-3, 1.0, 14), 2)
+    f = np.repeat([0.1, 1.0], 14)
+    rng = np.random.default_rng(3)
+    noise = 1.0 + 0.005 * rng.standard_normal((28, 2)) @ [1.0, 1.0j]
+
+    def tried(law):
+        N = law.dynamic_stiffness(A, 2.0 * np.pi * f)
+        data = di.FrequencyResponse(f, N * noise, A)
+        return [m.name for m in compare_models(fit(data, di.Dahl(), throw=False)).models]
+
+    assert "LuGre" in tried(di.LuGre(1.0, 100.0, 1.8, 0.5))
+
+    assert "LuGre" not in tried(di.Dahl(1.0, 100.0) + di.Damper(0.5))
+
+
+def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl():
+    A = np.geomspace(1e-3, 1.0, 12)
+    rng = np.random.default_rng(4)
+    noise = 1.0 + 0.01 * rng.standard_normal((12, 2)) @ [1.0, 1.0j]
+    law = di.LuGre(1.0, 100.0, 1.8, 0.5)
+
+    def sentences(frequency):
+        N = law.dynamic_stiffness(A, 2.0 * np.pi * frequency) * noise
+        given = fit(di.FrequencyResponse(np.full(12, frequency), N, A), di.Dahl(), throw=False)
+        asked = di.LuGre(static_ratio=1.8, stribeck_speed=0.5)
+        (_, lugre) = compare_models(given, {"LuGre": asked}).models
+        return lugre.resemblances
+
+    (text,) = sentences(100.0)
+    assert text.startswith("LuGre: at these levels it differs from linear Dahl with a damper by")
+    assert not sentences(0.2)
+
+
 def test_the_model_that_was_fitted_stands_with_what_it_states():
     result = fit(table(noise=1e-3), di.Dahl() + di.Mass(0.01))
     found = compare_models(result, {"spring": di.Dahl() + di.Spring()})

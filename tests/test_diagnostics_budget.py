@@ -149,10 +149,27 @@ class TestBudget:
             assert found.k > 3.0
         assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(0.05 / np.sqrt(3.0), rel=0.4)
 
-    def test_two_days_have_wide_intervals(self):
-        two = fit(three_days(0.05, 100).select(run=["mon", "tue"]), Dahl())
-        assert max(row.k for row in two.budget().values()) > 8.0
+    def test_the_verdict_says_why_two_days_have_wide_intervals(self):
+        days = three_days(0.05, 100)
+        two = fit(days.select(run=["mon", "tue"]), Dahl())
+        (said,) = (str(f) for f in two.findings if f.code == "few_runs")
+        k = max(row.k for row in two.budget().values())
+        t = stats.t(df=2).ppf(0.97725)
+        assert k > 8.0
+        assert said.endswith(
+            f"so the coverage factor k is up to {k:.3g}; with another run, about {t:.2g}."
+        )
+        assert said in str(two.verdict)
         assert two.status == "trusted"
+
+    @pytest.mark.parametrize("seed", [103, 113])
+    def test_so_it_does_for_two_days_that_agree(self, seed):
+        two = fit(three_days(0.0, seed).select(run=["mon", "tue"]), Dahl(alpha=1.0))
+        rows = two.budget().values()
+        assert "scatter between runs" not in {part.source for row in rows for part in row.rows}
+        (said,) = (str(f) for f in two.findings if f.code == "few_runs")
+        assert said.startswith("The scatter of 2 runs has 1 degree of freedom, so the coverage ")
+        assert f"k is up to {max(row.k for row in rows):.3g}; with another run" in said
 
     @pytest.mark.parametrize("scatters", [("sigma",), ("f_max", "sigma")])
     def test_each_parameter_of_friction_scatters_on_its_own(self, scatters):

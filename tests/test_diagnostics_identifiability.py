@@ -37,6 +37,7 @@ class TestVerdicts:
         assert found.complete
         assert found.determined == ("f_max", "sigma")
         assert not found.combinations
+        assert not found.direction
 
     def test_every_parameter_of_a_plant(self):
         result = fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
@@ -75,7 +76,7 @@ class TestVerdicts:
         assert abs(kappa.value - SIGMA**2 / F_MAX) < 4.0 * kappa.stderr
         assert abs(total.value - 2.0 * SIGMA) < 4.0 * total.stderr
         assert kappa.unit == "N/m^2"
-        assert "the free stiffness can take its place" in found.parameters["f_max"].text
+        assert "free stiffness hides it below 0.00033 m" in found.parameters["f_max"].text
         assert found.headline.startswith("Only sigma^2/f_max and sigma + stiffness are determined")
 
     def test_what_runs_away_determines_only_what_its_limit_says(self):
@@ -90,6 +91,12 @@ class TestVerdicts:
         result = fit(data, Dahl() + Spring(), throw=False)
         assert np.isinf(result.params["f_max"].value)
         assert identifiability(result).determined == ("sigma^2/f_max", "sigma + stiffness")
+
+    def test_a_stiffness_hidden_by_a_spring_is_no_slip(self):
+        """f_max and sigma fade together: the reason is the spring, not amplitudes too large."""
+        data = table(model=FRICTION + Spring(SIGMA), beta=(1e-2, 1e-1), noise=0.004)
+        text = identifiability(fit(data, Dahl() + Spring(), throw=False)).parameters["sigma"].text
+        assert "the free stiffness can take its place: drive far into slip" in text
 
     def test_friction_lost_in_the_noise_gives_no_advice_on_slip(self):
         """Deep slip with a spring: nothing tells it from microslip, so neither is claimed."""
@@ -159,6 +166,9 @@ class TestVerdicts:
         result = fit(table(), Dahl(), sensors=Sensors(displacement_gain=None), throw=False)
         found = identifiability(result)
         assert found.determined == ("f_max",)
+        assert set(found.direction) == {"sigma", "displacement_gain"}
+        sigma, gain = found.direction["sigma"], found.direction["displacement_gain"]
+        assert abs(sigma) == pytest.approx(abs(gain), rel=1e-3)
         assert "calibrate the displacement channel" in str(found)
 
     def test_a_prior_on_the_gain_restores_everything(self):
@@ -205,6 +215,23 @@ class TestVerdicts:
         data = table(model=FRICTION + Spring(SIGMA), beta=(1e-2, 1e-1), noise=0.004)
         found = identifiability(fit(turned(data), Dahl(alpha=1.0) + Spring(), throw=False))
         assert [c.unit for c in found.combinations] == ["N m/rad^2", "N m/rad"]
+
+    @pytest.mark.parametrize(
+        "seed", [0, *(pytest.param(s, marks=pytest.mark.long) for s in (6, 9, 10))]
+    )
+    def test_friction_that_does_not_show_leaves_the_stiffness_seen(self, seed):
+        """Where friction may as well be none, sigma and its sum with the spring have no end."""
+        data = table(model=FRICTION + Spring(30.0), beta=(1e-3, 1e-2), seed=seed)
+        found = identifiability(fit(data, Dahl(alpha=1.0) + Spring(), throw=False))
+        (seen,) = found.combinations
+        assert seen.name == "the stiffness seen at 1.05e-05 m"
+        assert found.headline == f"Only {seen.name} is determined; not f_max, sigma and stiffness."
+        middle = np.sqrt(1e-3 * 1e-2) * X_C
+        truth = FRICTION.describing_function(middle).real + 30.0
+        assert seen.value == pytest.approx(truth, abs=3.0 * seen.stderr)
+        of_mean = 0.01 * truth / np.sqrt(30.0)  # by noise alone; other sources may add to it
+        assert 0.7 * of_mean < seen.stderr < 4.0 * of_mean
+        assert seen.unit == "N/m"
 
 
 class TestTheory:
@@ -270,6 +297,7 @@ def test_the_fundamental_leaves_the_order_open_and_the_verdict_says_so():
     assert not fit.trusted
     assert "pull and push are exchangeable: these data are the same for either" in fit.verdict
     assert sorted(fit.optimum.values[:2]) == pytest.approx([0.06, 0.14], rel=0.05)
+    assert not found.direction
 
 
 def test_even_harmonics_decide_it():

@@ -10,7 +10,7 @@ import dahl_ident as di
 from benchmarks.measured import beam_table
 from dahl_ident import extract, fit
 from dahl_ident.diagnostics import Verdict
-from dahl_ident.diagnostics.jenkins_bound import least_misfit
+from dahl_ident.diagnostics.slip_density import slip_density
 from tests.measured import assert_still, dampers, needs_measured
 
 pytestmark = needs_measured
@@ -54,9 +54,12 @@ class TestDamper:
             data = di.FrequencyResponse(damper.frequency_hz, damper.response, damper.amplitude)
         found = fit(data, di.Dahl())
         assert not found.trusted
-        assert "over frequency the data depart from the model by" in found.verdict
+        assert "over frequency friction's stiffness falls by" in found.verdict
         assert any("over frequency, from 0.25 to 2 Hz" in text for text in found.goodness.details)
         assert "which no rate-independent model can describe" in found.verdict
+        linear = fit(data, di.Dahl(alpha=1.0)).goodness
+        (trend,) = (t for t in linear.of("trend") if t.about == "frequency")
+        assert np.expm1(trend.values["stiffness"].value) == pytest.approx(-0.26, abs=0.04)
 
     @pytest.mark.long
     def test_runs_deviate_within_the_bounds_of_parameters(self):
@@ -128,8 +131,9 @@ class TestBeam:
         assert 3.8e7 < kappa.value < 4.7e7
         assert "f_max/sigma" not in found.identifiability.determined
         assert "f_max: at least" in found.verdict
-        assert "can take its place" in found.verdict
+        assert "hides it below" in found.verdict
         assert "The model does not describe these data" in found.verdict
+        assert "stiffness rises with amplitude, by 0." in found.verdict
 
     def test_controlled_response_has_its_optimum_at_infinity(self, beam):
         found = self.fitted(beam, "Response")
@@ -149,7 +153,7 @@ class TestBeam:
         )
         check = found.cross_validation
         assert check.inside >= 0.88 * check.count  # of 95 %: less happens once in 200 times
-        chi, bound = found.params["chi"], least_misfit(data, [di.Mass(), di.Damper()])
+        chi, bound = found.params["chi"], slip_density(data, di.Mass() + di.Damper()).least_misfit
         assert -1.0 < chi.value <= 3.0
         assert chi.stderr is not None
         assert 0.2 < bound < found.goodness.rms_misfit < 0.4

@@ -33,8 +33,53 @@ def test_a_sign_is_named_where_there_is_no_finite_optimum():
 
 
 class TestRows:
-    def test_side_by_side_the_model_may_fail_there(self):
-        """As where a stop is hit; a robust loss would hide it."""
+    def test_lead_the_verdict_where_they_alone_are_the_cause(self):
+        data = load_dataset("outliers")
+        found = fit(data, Dahl())
+        kept = ~np.isin(np.arange(30), [18, 19, 27])  # as the data set was made
+        alone = fit(data.select(rows=kept), Dahl()).goodness.rms_misfit
+        first = found.statements[0]
+        assert "Only 3 of 30 rows (1 Hz, 24.3 mm; 1 Hz, 6.81 mm; 1 Hz, 5.81 mm) contradict" in first
+        assert (
+            f"the residuals are consistent with noise ({100.0 * alone:.2g} % rms misfit)" in first
+        )
+        assert "fit with loss='huber', which down-weights them" in first
+        assert "not linear Dahl" not in found.verdict
+        assert found.ndata == 60  # none is dropped
+        assert fit(data, Dahl(), loss="huber").trusted
+
+    def test_a_single_row(self):
+        first = fit(scaled(table(), [7], [2.0]), Dahl()).statements[0]
+        assert "Only the row at 1 Hz, 1.01 mm contradicts the model" in first
+        assert "without it the residuals are consistent with noise" in first
+
+    @pytest.mark.parametrize(("fall", "explains"), [(2.0, False), (4.5, True)])
+    def test_explain_only_where_the_misfit_falls_to_a_third(self, fall, explains):
+        # n rows with errors s in gain and phase have a mean square misfit of 2 s^2, to which one
+        # that misses by d adds d^2/n; measured by its own size it is off by d/(1 - d)
+        n, s = 60, 0.01
+        missed = s * np.sqrt(2.0 * n * (fall**2 - 1.0))
+        off = missed / (1.0 - missed)
+        data = table(n=n, noise=s)
+        C = np.eye(2) * (s * np.abs(data.response))[:, None, None] ** 2
+        found = fit(scaled(replace(data, covariance=C), [31], [1.0 + off]), Dahl(), throw=False)
+        alone = fit(replace(data, covariance=C), Dahl()).goodness.rms_misfit
+        assert found.goodness.rms_misfit == pytest.approx(fall * alone, rel=0.25)
+        assert ("Only the row at 1 Hz, 3.75 mm contradicts" in found.verdict) == explains
+
+    def test_do_not_lead_where_a_departure_is_left_without_them(self):
+        data = scaled(table(model=Dahl(0.1, 30.0, alpha=1.5)), [7, 19], [3.0, 0.3])
+        found = fit(data, Dahl(alpha=1.0))
+        assert {point.row for point in found.goodness.suspicious} >= {7, 19}
+        assert found.goodness.cause == ""
+        assert "rms misfit" in found.statements[0]
+
+    def test_do_not_lead_where_they_lie_side_by_side(self):
+        """As where a stop is hit: the model may fail there, and a robust loss would hide it."""
+        found = fit(scaled(table(), [27, 28, 29], [1.3, 1.5, 1.8]), Dahl())
+        assert found.goodness.cause == ""
+        assert "do not cover the misfit" in found.verdict
+        assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in found.fit_report()
         robust = fit(scaled(table(), [27, 28, 29], [1.3, 1.5, 1.8]), Dahl(), loss="huber")
         assert robust.status is VerdictStatus.APPROXIMATE
         assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in robust.verdict
@@ -86,10 +131,23 @@ def test_the_error_of_an_exponent_asked_for_follows_the_scatter():
     assert "(error widened " in str(claimed)
 
 
-def test_a_missing_mass_is_no_wrong_sign():
-    """Far above resonance the response has the sign of the mass, and its loss that of all."""
-    A = np.geomspace(0.1, 10.0, 30) * X_C
-    Z = (FRICTION + Mass(1.0)).dynamic_stiffness(A, 4.0 * np.pi) * relative_noise(30, 0.01, 1)
-    found = fit(FrequencyResponse(np.full(30, 2.0), Z, A), Dahl(), throw=False).goodness
-    assert found.objections
-    assert not found.sign
+class TestNoCause:
+    def test_a_missing_mass_is_no_wrong_sign(self):
+        """Far above resonance the response has the sign of the mass, and its loss that of all."""
+        A = np.geomspace(0.1, 10.0, 30) * X_C
+        Z = (FRICTION + Mass(1.0)).dynamic_stiffness(A, 4.0 * np.pi) * relative_noise(30, 0.01, 1)
+        found = fit(FrequencyResponse(np.full(30, 2.0), Z, A), Dahl(), throw=False).goodness
+        assert found.objections
+        assert found.cause == ""
+
+    def test_a_missing_mass_is_no_single_bad_row(self):
+        A, f = np.tile(np.geomspace(0.1, 10.0, 5) * X_C, 2), np.repeat([1.0, 4.0], 5)
+        Z = (FRICTION + Mass(0.01)).dynamic_stiffness(A, 2.0 * np.pi * f)
+        found = fit(FrequencyResponse(f, Z * relative_noise(10, 0.01, 0), A), Dahl())
+        assert found.goodness.suspicious
+        assert found.goodness.cause == ""
+
+    def test_the_last_row_may_be_where_the_model_ends(self):
+        found = fit(scaled(table(), [29], [1.5]), Dahl())
+        assert [point.row for point in found.goodness.suspicious] == [29]
+        assert found.goodness.cause == ""

@@ -36,6 +36,14 @@ def test_without_stribeck_effect_it_is_linear_dahl_with_a_damper():
                                atol=1e-8 * np.abs(dahl).max())  # fmt: skip
 
 
+def test_the_distance_from_dahl_says_when_sines_show_a_difference():
+    A = np.geomspace(1e-3, 0.3, 10)
+    law = LuGre(1.0, 300.0, 1.5, 0.02)
+    assert law.distance_from_dahl(A, np.asarray(1e-4)) < 1e-4  # all speeds below Stribeck's
+    assert law.distance_from_dahl(A, np.asarray(1e4)) < 1e-3  # all far above
+    assert law.distance_from_dahl(A, np.asarray(1.0)) > 0.02
+
+
 def test_facts_and_refusals():
     with pytest.raises(ModelError, match="depends on the rate"):
         LAW.describing_function(1.0)
@@ -188,3 +196,8 @@ def test_a_root_of_a_speed_may_be_divided_within_it(divided, whole):
     ]
     assert float(found[0]) == pytest.approx(float(found[1]), rel=1e-9)
     assert float(found[1]) == pytest.approx(0.0584, abs=1e-4)
+
+
+def test_a_value_beyond_its_bound_by_rounding_is_at_the_bound():
+    values = [0.1, 30.0, np.nextafter(100.0, 101.0), 0.1, 0.0, 0.0]
+    assert LuGre().resembles(values, np.array([1e-3, 1e-2]), np.array([6.0, 6.0])) is not None

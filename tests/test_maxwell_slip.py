@@ -9,8 +9,8 @@ from scipy.optimize import lsq_linear
 
 import dahl_ident as di
 from dahl_ident import fit
-from dahl_ident.diagnostics.jenkins_bound import least_misfit
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.diagnostics.slip_density import slip_density
+from dahl_ident.errors import DataError, ModelError, ValidationError
 from tests.derivatives import central_differences
 from tests.histories import jenkins_force
 from tests.recovery import assert_near
@@ -96,27 +96,40 @@ def test_stiffnesses_are_estimated_at_given_and_at_free_slips():
 
 
 def test_the_least_misfit_is_least():
-    """Another solver over the same laws leaves no less."""
-    data = table(LAW + di.Mass(0.1) + di.Damper(-0.05), noise=0.01)
-    found = least_misfit(data, [di.Mass(0.1), di.Damper()])
-    assert 0.003 < found < 0.0101
+    data = table(LAW + di.Mass(0.1) + di.Damper(0.2), noise=0.01)
+    found = slip_density(data, di.Mass(0.1) + di.Damper())
+    assert 0.003 < found.least_misfit < 0.0101
+    assert found.least_misfit <= found.misfit <= 1.05 * found.least_misfit
+    assert found.stiffness.sum() + found.spring == pytest.approx(6.0, rel=0.05)
+    assert found.parallel["damping"] == pytest.approx(0.2, rel=0.2)
+    # another solver over the same laws, and random laws, leave no less
     A, Z = np.asarray(data.amplitude), data.response + 0.1 * data.omega**2
-    slips = np.geomspace(A.min() / 100.0, A.max(), 48 * 4)
-    jenkins = [di.MaxwellSlip([d], [1.0]).describing_function(A) for d in slips]
-    columns = np.column_stack([*jenkins, 1.0 + 0j * A, -1j * data.omega])
+    jenkins = [di.MaxwellSlip([d], [1.0]).describing_function(A) for d in found.slip.tolist()]
+    columns = np.column_stack([*jenkins, 1.0 + 0j * A, 1j * data.omega])
     weights = 1.0 / np.abs(data.response)[:, None]
     matrix, right = columns * weights, Z * weights[:, 0]
     other = lsq_linear(
         np.concatenate([matrix.real, matrix.imag]), np.concatenate([right.real, right.imag]),
         bounds=(0.0, np.inf), tol=1e-12, method="bvls", max_iter=1000,
     )  # fmt: skip
-    assert np.sqrt(2.0 * other.cost / 24) == pytest.approx(found, rel=0.01)
+    assert np.sqrt(2.0 * other.cost / 24) == pytest.approx(found.least_misfit, rel=1e-3)
+    assert "leaves less than" in found.statement
+    law = found.law() + di.Mass(0.1) + di.Damper(found.parallel["damping"])
+    left = np.abs(1.0 - law.dynamic_stiffness(A, data.omega) / data.response)
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(found.misfit, rel=1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.4, -0.05])
+def test_a_damper_in_parallel_with_a_density_has_either_sign(damping):
+    found = slip_density(table(LAW + di.Damper(damping)), di.Damper())
+    assert found.parallel["damping"] == pytest.approx(damping, rel=0.02)
+    assert found.least_misfit < 0.003
 
 
 def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements():
-    assert least_misfit(table(di.Dahl(1.0, 6.0))) > 0.05
-    assert least_misfit(table(di.Backlash(Jenkins(3.0, 0.3), 0.05))) > 0.1
-    assert least_misfit(table(LAW)) < 0.003
+    assert slip_density(table(di.Dahl(1.0, 6.0))).least_misfit > 0.05
+    assert slip_density(table(di.Backlash(Jenkins(3.0, 0.3), 0.05))).least_misfit > 0.1
+    assert slip_density(table(LAW)).least_misfit < 0.003
 
 
 @pytest.mark.parametrize(
@@ -133,13 +146,21 @@ def test_the_verdict_says_what_such_laws_leave(truth, said):
     data = table(truth, noise=0.01)
     found = fit(data, di.Dahl(), throw=False)
     assert re.search(said, found.verdict)
-    bound = least_misfit(data)
+    bound = slip_density(data).least_misfit
     assert f"{100.0 * bound:.2g} % (rms of the fundamental)" in found.verdict
+
+
+def test_the_density_is_refused():
+    data = table(LAW)
+    with pytest.raises(ModelError, match="expected linear elements"):
+        slip_density(data, di.Dahl())
+    with pytest.raises(DataError, match="at least three"):
+        slip_density(data.select(rows=np.arange(24) < 2))
 
 
 def test_the_verdict_is_silent_where_such_laws_leave_more_than_the_model():
     data = table(di.Dahl(1.0, 6.0, alpha=2.0), noise=0.01)
     found = fit(data, di.Dahl(), throw=False)
     assert found.goodness.objections
-    assert least_misfit(data) > found.goodness.rms_misfit
+    assert slip_density(data).least_misfit > found.goodness.rms_misfit
     assert "Jenkins" not in found.verdict

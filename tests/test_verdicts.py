@@ -40,12 +40,59 @@ def stiffened(rise, noise=0.01, seed=1):
     return FrequencyResponse(np.ones(48), N, A)
 
 
+def rise(data, model=None):
+    """Return the rise of stiffness with the amplitude that a fit's goodness holds, or None."""
+    made = fit(data, model or Dahl(alpha=1.0) + Spring(), throw=False)
+    return next(iter(made.goodness.of("stiffening")), None)
+
+
+class TestStiffening:
+    def test_size_and_place_of_a_rise(self):
+        found = rise(stiffened(0.2))
+        assert found.values["rise"] == pytest.approx(0.17, abs=0.02)
+        assert found.values["low"] < 0.02 * X_C < 0.06 * X_C < found.values["high"]
+        assert found.p_value < 1e-9
+
+    def test_the_verdict_says_so(self):
+        result = fit(stiffened(0.2), Dahl(alpha=1.0) + Spring(), throw=False)
+        assert "stiffness rises with amplitude, by" in result.verdict
+        assert "which this law cannot describe" in result.verdict
+
+    def test_noise_alone_seldom_looks_so(self):
+        made = [rise(stiffened(0.0, noise=0.05, seed=seed)) for seed in range(30)]
+        p = np.array([1.0 if one is None else one.p_value for one in made])
+        assert np.mean(p < 0.05) < 0.1
+
+    def test_other_exponents_do_not_look_so(self):
+        for alpha in (0.3, 1.0, 2.0):
+            found = rise(table(model=Dahl(0.1, 30.0, alpha=alpha)), Dahl(alpha=1.0))
+            assert found is None or found.p_value > 0.01
+
+    def test_a_free_mass_takes_a_degree_of_freedom_and_other_elements_none(self):
+        A = np.repeat([1e-3, 1e-1], 5) * np.tile(np.geomspace(1.0, 1.05, 5), 2) * X_C
+        Z = np.repeat([30.0, 36.0], 5) * (1.0 + 0.01j) * relative_noise(10, 1e-3, 1)
+        data = FrequencyResponse(np.ones(10), Z, A)
+        assert rise(data, Dahl(alpha=1.0) + Spring()).values["rise"] == pytest.approx(0.2, abs=0.01)
+        assert rise(data, Dahl(alpha=1.0) + Spring() + Mass()) is None
+
+    def test_it_needs_friction_and_points(self):
+        assert rise(stiffened(0.2), Spring()) is None
+        assert rise(table(n=4), Dahl(alpha=1.0)) is None
+        few = FrequencyResponse(np.ones(8), np.geomspace(30.0, 1.0, 8) * (1.0 + 0.2j), STEPS)
+        assert rise(few, Dahl(alpha=1.0) + Spring() + Mass()) is None
+
+
 class TestSuspiciousRows:
+    def test_rows_that_alone_contradict_ask_for_no_element(self):
+        codes = {f.code for f in fit(load_dataset("outliers"), Dahl(), throw=False).findings}
+        assert "rows_apart" in codes
+        assert "beyond_slip" not in codes
+
     def test_most_rows_are_not_outliers(self):
         found = fit(load_dataset("alpha_2"), Dahl(alpha=1.0), loss="student_t", throw=False)
         codes = {f.code for f in found.findings}
         assert "misfit" in codes
-        assert "suspicious" not in codes
+        assert not codes & {"rows_apart", "suspicious"}
 
 
 class TestTrust:
@@ -173,6 +220,14 @@ def _scattered(seed, off=1.0):
     return FrequencyResponse(np.ones(16), R, A)
 
 
+def test_a_robust_fit_that_moves_an_estimate_is_said_without_suspicious_rows():
+    fitted = fit(_scattered(22, 1.1), Dahl())
+    assert not fitted.goodness.suspicious
+    assert "A robust fit moves sigma by more than one standard uncertainty" in fitted.verdict
+    assert str(fitted.status) == "approximate"
+    assert fit(_scattered(22), Dahl()).trusted
+
+
 def test_what_only_a_prior_determines_is_not_called_identified():
     tight = fit(_scattered(3), Dahl(), sensors=Sensors(force_gain=stats.norm(1.0, 0.01)))
     known = tight.identifiability
@@ -205,6 +260,18 @@ def test_a_free_delay_states_the_gain_that_it_assumes():
 class TestNamed:
     """What makes a result doubtful has a sentence, and is in the status."""
 
+    def test_a_force_that_friction_cannot_carry(self):
+        """A sinusoidal force above the limit, with nothing else to carry it."""
+        A = np.geomspace(0.1, 20.0, 14) * X_C
+        N = FRICTION.describing_function(A) * relative_noise(14, 0.01, 1)
+        for strongest, named in ((0.09, False), (0.12, True)):
+            kept = np.abs(N) * A < strongest
+            data = driven(np.ones(kept.sum()), 1.0 / N[kept], (np.abs(N) * A)[kept])
+            found = fit(data, Dahl(), steady="describing function", throw=False)
+            assert ("the force held exceeds friction's limit (0." in found.verdict) is named
+            if named:
+                assert not found.trusted
+
     def test_at_a_resonance_harmonics_of_friction_are_carried(self):
         """Mass and spring cancel there, but not at the harmonics that friction has."""
         plant = Dahl(15.0, 2e6, 1.0) + Mass(40.0) + Damper(300.0) + Spring(2e5)
@@ -213,6 +280,7 @@ class TestNamed:
         R = response(plant, f, u).receptance * relative_noise(24, 0.005, 3)
         model = Dahl(alpha=1.0) + Mass(40.0) + Damper() + Spring()
         found = fit(driven(f, R, u, 0.005, level=u), model)
+        assert "beyond_limit" not in {one.code for one in found.findings}
         assert found.trusted
 
     def test_points_that_were_all_flagged(self):
@@ -259,7 +327,7 @@ class TestNamed:
         check = found.cross_validation
         assert check.rows == 16
         text = f"{check.gains} of 16 held-out gains and {check.phases} of 16 phases of fundamentals"
-        assert text in str(check)
+        assert text in found.fit_report()
 
     def test_the_verdict_is_five_sentences_and_the_rest_stands_below(self):
         """Runs that differ, rows that were flagged or are suspicious, and a wrong law."""

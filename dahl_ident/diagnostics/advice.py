@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from dahl_ident.diagnostics.contributions import ALONG_MOTION, EXPONENT, MODEL_ERROR, RUNS
+from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.intervals import Interval
 from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.diagnostics.record_errors import RecordErrors
 from dahl_ident.elements import Element, Model, Parameter
-from dahl_ident.elements.parameter import FORCE, STIFFNESS
+from dahl_ident.elements.parameter import FORCE, STIFFNESS, Dimension
 from dahl_ident.elements.recursion import Stretches, stretches
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem.record_problem import RecordProblem
@@ -50,6 +51,8 @@ def advice(optimum: Optimum, name: str, limits: Interval, lost: frozenset[str]) 
         if element.has_memory:
             parameter = element.parameters[names.index(name)]
             return _friction_advice(optimum, element, parameter, limits, lost)
+        if is_spring(element):
+            return _spring_advice(optimum, lost)
     return (
         "because its effect on these data is below their noise or like that of another parameter: "
         "fix it, or measure where its effect is larger"
@@ -74,33 +77,75 @@ def _friction_advice(
 ) -> str:
     """Return the advice on a parameter of friction."""
     label, dimension = element.label(parameter), parameter.dimension
+    scales = label in element.scale_parameters
     amplitude = optimum.problem.stiffness_data.amplitude
     unit = shown_unit("m", optimum.problem.data.motion)
     least, most = f"{amplitude.min():.2g} {unit}", f"{amplitude.max():.2g} {unit}"
     elements = optimum.problem.model.elements
-    rivals = (e for e in elements if e is not element and e.kind == element.kind)
-    for rival in (e.parameter(label).name for e in rivals if label in e.labels):
-        if rival in lost:
-            return f"because {rival} can take its place: leave one of the two elements out"
-    if not any(dimension):
+    for rival_element in elements:  # the same parameter of another element of this law
+        if (
+            rival_element is not element
+            and rival_element.kind == element.kind
+            and label in rival_element.labels
+        ):
+            rival = rival_element.parameter(label).name
+            if rival in lost:
+                return f"because {rival} can take its place: leave one of the two elements out"
+    values = parameter_values(optimum)
+    low, high = map(float, element.knee([np.asarray(values[p.name]) for p in element.parameters]))
+    if not scales and not any(dimension):
+        near = f"{low:.2g} {unit}" if low == high else f"{low:.2g} to {high:.2g} {unit}"
         return (
             f"because {parameter.name} shows only where stick turns to slip, and the data from "
-            f"{least} to {most} do not resolve it: add amplitudes there, or fix it"
+            f"{least} to {most} do not resolve it: add amplitudes around {near}, or fix it"
         )
     springs = [p.name for e in elements if is_spring(e) for p in e.parameters if p.free]
-    if springs:
+    spring = next((name for name in springs if name in lost), springs[0] if springs else "")
+    parallel = f" in parallel with the free {spring}" if spring else ""
+    fix = f", or measure the spring and fix {spring}" if spring else ""
+    share = f"friction's share of the response from {least} to {most}"
+    unbounded = np.isinf(limits.upper)
+    sticks = amplitude.max() < low
+    is_limit, is_stiffness = scales and dimension == FORCE, scales and dimension == STIFFNESS
+    limit_lost = any(p.name in lost for p in _scaled(element, FORCE))
+    if spring and limits.lower <= 0.0 and unbounded and limit_lost:
+        reason = f"{share},{parallel}, is within the noise"
+        remedy = "cover amplitudes where it is larger, reduce the noise"
+    elif is_limit and unbounded:
+        hidden = f"the free {spring} hides it below {most}"
+        reason = hidden if spring else f"no amplitude up to {most} reaches slip"
+        remedy = "drive above that"
+    elif is_stiffness and spring and (spring in lost or sticks):
+        reason = f"the free {spring} can take its place"
+        remedy = "drive far into slip"
+    elif is_stiffness and unbounded and not limit_lost:
+        reason = f"every amplitude from {least} slips and friction's stiffness fades{parallel}"
+        remedy = "drive below that"
+    elif spring:
+        reason = f"the free {spring} explains the data from {least} to {most} nearly as well"
+        remedy = "cover more amplitudes"
+    else:
+        reason = f"{share} is within the noise"
+        remedy = "cover amplitudes where it is larger, or reduce the noise"
+    return f"because {reason}: {remedy}{fix}"
+
+
+def _scaled(element: Element, dimension: Dimension) -> list[Parameter]:
+    """Return the scale parameters of a dimension."""
+    scale = (element.parameter(label) for label in element.scale_parameters)
+    return [p for p in scale if p.dimension == dimension]
+
+
+def _spring_advice(optimum: Optimum, lost: frozenset[str]) -> str:
+    """Return the advice on the stiffness of a spring in parallel with friction."""
+    friction = (e for e in optimum.problem.model.elements if e.has_memory)
+    stiff = [p.name for e in friction for p in _scaled(e, STIFFNESS) if p.name in lost]
+    if stiff:
         return (
-            f"because the free {springs[0]} can take its place from {least} to {most}: cover more "
-            f"amplitudes, or measure the spring and fix {springs[0]}"
+            f"because friction's stiffness {stiff[0]} can take its place: measure the spring "
+            "without friction, or drive far into slip"
         )
-    if dimension == FORCE and np.isinf(limits.upper):
-        return f"because no amplitude up to {most} reaches slip: drive above that"
-    if dimension == STIFFNESS and np.isinf(limits.upper):
-        return f"because every amplitude from {least} slips: drive below that"
-    return (
-        f"because friction's share of the response from {least} to {most} is within the noise: "
-        "cover amplitudes where it is larger, or reduce the noise"
-    )
+    return "because its force is below the noise of the response: measure where it is larger"
 
 
 def record_advice(

@@ -30,8 +30,9 @@ from dahl_ident.diagnostics.intervals import (
     profile_intervals,
     wald_intervals,
 )
+from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
-from dahl_ident.elements import Model
+from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DahlIdentError, FitError, ValidationError, choices
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.optimum import ConstraintCost, Optimum, propagated
@@ -393,6 +394,24 @@ class TableAssessment(Assessment):
             value, u = errors.values[p.name], errors.stderr[p.name]
             if max(low - value, value - high) > _OUTSIDE_RANGE * u:
                 yield ContradictedExponent(p.name, value, value, u, (low, high))
+
+    @property
+    def significant_misfit(self) -> tuple[float, float] | None:
+        """The rms misfit within runs, and in all; None where it is consistent with noise."""
+        rows = self.problem.stiffness_data.harmonic == 1
+        if not (self.goodness.objections and self.is_determined and rows.any()):
+            return None
+        misfit = within = self.goodness.rms_misfit
+        if self.errors is not None:  # differences between runs are not part of the misfit
+            within = min(misfit, rms_misfit_of(self.errors.problem, self.errors.within_runs))
+        return within, misfit
+
+    def force_share(self, element: Element, value: float) -> float:
+        """Return the rms stiffness of an element of one parameter over that of the whole."""
+        view = self.problem.stiffness_data
+        rows = view.harmonic == 1
+        part = view.stiffness_of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
+        return float(np.sqrt(np.mean(np.abs(part) ** 2)))
 
     @property
     def runs(self) -> int:

@@ -11,6 +11,7 @@ combination                               determined in
 products that an element names            microslip, an unknown gain: `Element.combinations`
 stiffness of friction + that of a spring  microslip: the stiffness seen at small amplitudes
 sums over two elements of one law         all slipping, or none: of force limits or stiffnesses
+stiffness seen, of friction and springs   springs that hide all of friction
 ========================================  =====================================================
 """
 
@@ -25,6 +26,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.storage import library as data_library
+from dahl_ident.diagnostics.bands import friction_and_slopes
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY, coverage_factor
 from dahl_ident.diagnostics.contributions import CHANNELS, TYPE_A, ErrorContributions, variances
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
@@ -40,7 +42,7 @@ from dahl_ident.diagnostics.formatting import (
     tabular,
     unit,
 )
-from dahl_ident.diagnostics.information import Information
+from dahl_ident.diagnostics.information import Information, parameter_values
 from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.elements import Parameter
 from dahl_ident.elements.parameter import STIFFNESS
@@ -105,6 +107,34 @@ def candidates(optimum: Optimum) -> list[Candidate]:
     return formed
 
 
+def stiffness_seen(optimum: Optimum) -> Candidate | None:
+    """Return the stiffness of friction and free springs together, in the middle of the amplitudes.
+
+    None without friction and a free spring. Stiffness data always determine it, so it is reported
+    only if they determine nothing else.
+    """
+    problem, names = optimum.problem, optimum.names
+    elements = problem.model.elements
+    springs = [p.name for e in elements if is_spring(e) for p in e.parameters]
+    friction = [
+        e.parameter(label).name for e in elements if e.has_memory for label in e.scale_parameters
+    ]
+    free = frozenset(springs) & frozenset(names)
+    if not free or not friction:
+        return None
+    A = float(np.exp(np.log(problem.stiffness_data.amplitude).mean()))
+    N, by = friction_and_slopes(problem, optimum.theta, np.array([A]))
+    values = parameter_values(optimum)
+    slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
+    of_springs = np.array([slopes[name] if name in free else 0.0 for name in names])
+    value = float(N[0].real) + sum(values[name] for name in springs)
+    motion = problem.data.motion
+    name = f"the stiffness seen at {A:.3g} {shown_unit('m', motion)}"
+    direction = (by[0].real + of_springs) / value
+    members = free | (frozenset(friction) & frozenset(names))
+    return Candidate(name, shown_unit("N/m", motion), value, direction, members)
+
+
 def _unit(powers: Mapping[Parameter, float]) -> str:
     """Return the unit of a product, such as "N/m^2"."""
     above, below = list[str](), list[str]()
@@ -145,6 +175,11 @@ class ParameterBudget:
     def U(self) -> float:
         """Expanded uncertainty, k u."""
         return self.k * self.u
+
+    def k_without(self, *sources: str) -> float:
+        """Return the coverage factor if what these sources contribute were known exactly."""
+        spread = sum(r.share**2 / r.dof for r in self.rows if r.source not in sources)
+        return coverage_factor(1.0 / spread if spread > 0.0 else np.inf)
 
     @property
     def expanded(self) -> str:

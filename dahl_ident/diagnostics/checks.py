@@ -8,15 +8,18 @@ of records both have, unless it is marked as a check of tables or of records onl
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import partial, wraps
 from typing import Any
 
 import numpy as np
 
+from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import warnings_in
 from dahl_ident.diagnostics.assessment import TableAssessment
-from dahl_ident.diagnostics.contributions import NOISE
+from dahl_ident.diagnostics.contributions import NOISE, RUNS, TESTS
 from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.estimate import scores_of
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.judgement import (
     Finding,
@@ -29,13 +32,19 @@ from dahl_ident.diagnostics.judgement import (
 )
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.physics import (
+    beyond_friction_limit,
     is_single,
     negative_elements,
     steady_findings,
+    weak_elements,
 )
 from dahl_ident.diagnostics.record_assessment import RecordAssessment
 from dahl_ident.diagnostics.record_errors import REMEDY
+from dahl_ident.errors import FitError
 from dahl_ident.extraction.segment_quality import clipped_share, sensor_step
+from dahl_ident.fitting.losses import LOSSES
+from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.noise import squares_of
 from dahl_ident.units import si_unit
 
 _LARGEST_RMS = 0.5  # misfit above which the model does not describe half of the response
@@ -44,11 +53,13 @@ _LARGEST_RMS_OF_WRONG_LAW = 0.05  # the same if another law has a far smaller mi
 _SLOW = 0.3  # effective share of the samples below which a misfit may look like slow noise
 _VISIBLE = 0.05  # rms of such a misfit, as a share of the output, from which it is reported
 _FEW_DOF = 10.0  # degrees of freedom: an uncertainty is then known to 20 %
+_FEW_RUNS, _WIDE = 3, 4.0  # most runs that are few; k twice that of many
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _ENOUGH_HELD_OUT = 16  # held-out values: with 16, fewer than 80 % in 95 % bands is a 1 % chance
 _MOST_WARNINGS = 5  # warnings shown; more would hide the verdict
 _CONTRADICTION = 0.0027  # p-value up to which the data contradict a constraint
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
+_ITERATIONS, _SETTLED = 100, 1e-3  # most of a robust fit; its tolerance in uncertainties
 
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 Assessed = TableAssessment | RecordAssessment
@@ -220,6 +231,16 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
     return min(rms_misfit_of(errors.problem, responses) for responses in fitted)
 
 
+@_of_tables
+def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
+    """Yield where a force exceeds the limit of friction, except in rows that stand apart."""
+    errors, scatter = fit.errors, sum(fit.goodness.runs_scatter.values())
+    optimum = fit.optimum if errors is None else errors.at_estimate
+    excused = optimum.loss != "linear" or fit.goodness.apart  # outliers are reported as such
+    outliers = [p.row for p in fit.goodness.suspicious] if excused else []
+    yield from beyond_friction_limit(optimum, scatter, outliers)
+
+
 def _unphysical(fit: Assessed) -> Iterator[Finding]:
     """Yield every mass, damping or stiffness below zero, and other physical objections."""
     yield from negative_elements(fit.problem, fit.known)
@@ -228,6 +249,12 @@ def _unphysical(fit: Assessed) -> Iterator[Finding]:
         if np.isfinite(values).all() and not is_single(element):
             for text in element.physical_objections(values):
                 yield described("unphysical", _APPROXIMATE, objection=text)
+
+
+def _weak_elements(fit: Assessed) -> Iterator[Finding]:
+    """Yield every mass, damper or spring whose force is smaller than the misfit."""
+    if fit.significant_misfit is not None:
+        yield from weak_elements(fit.problem, fit.known, fit.force_share, *fit.significant_misfit)
 
 
 def _constraints(fit: Assessed) -> Iterator[Finding]:
@@ -260,6 +287,41 @@ def _exponents(fit: Assessed) -> Iterator[Finding]:
             low, high = exponent.range
             values = {"value": value, "stderr": u, "low": low, "high": high}
             yield described("beyond_range", _APPROXIMATE, name=name, **values)
+
+
+@_of_tables
+def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
+    """Yield the parameters that a robust fit moves by more than their uncertainty from noise."""
+    if fit.optimum.loss != "linear" or fit.errors is None:
+        return
+    at = fit.by_noise
+    moves = zip(robust_values(at), at.values, at.stderr.items(), strict=True)
+    moved = tuple(name for robust, value, (name, u) in moves if abs(robust - value) > u)
+    if moved:
+        rows = tuple(point.name for point in fit.goodness.suspicious)
+        yield described("moved", _APPROXIMATE, names=moved, rows=rows)
+
+
+def robust_values(at: Optimum) -> FloatArray:
+    """Return the values (P,) of a robust fit to the model linearised at an estimate.
+
+    The scale of the noise, where it is not stated, is the robust one of
+    :mod:`dahl_ident.fitting.losses`.
+    """
+    problem, loss, scale = at.problem, LOSSES["huber"], at.scale
+    (y, J), m = problem.residuals_and_jacobian(at.theta), problem.n_residuals
+    move: FloatArray = np.zeros(len(at.theta))
+    for _ in range(_ITERATIONS):
+        if not problem.scale_known:
+            square = squares_of((y + J @ move)[:m] / scale)
+            scale *= loss.rescaled(square, m - len(move)) ** 0.5
+        unit = np.append(np.full(m, scale), np.ones(len(y) - m))  # priors have a known variance
+        scores, columns = scores_of((y + J @ move) / unit, m, loss), J / unit[:, None]
+        step = np.linalg.lstsq(columns, -scores, rcond=1e-10)[0]
+        move = move + step
+        if np.linalg.norm(columns @ step) < _SETTLED:
+            break
+    return np.asarray(problem.to_values(at.theta + move))
 
 
 @_of_records
@@ -327,6 +389,17 @@ def reading(fit: Any) -> Iterator[Finding]:
         yield described("more_warnings", count=len(texts) - _MOST_WARNINGS)
 
 
+def _few_runs(fit: Assessed) -> Iterator[Finding]:
+    """Yield that intervals are wide because few runs show the scatter between them."""
+    if not fit.counts_sources or not 1 < fit.runs <= _FEW_RUNS:
+        return
+    with suppress(FitError):  # nothing is determined
+        budgets = fit.budget().values()
+        wide = [b.k for b in budgets if b.k > _WIDE >= b.k_without(RUNS, TESTS)]
+        if wide:
+            yield assumed("few_runs", k=max(wide), runs=fit.runs)
+
+
 def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
     """Yield one finding with the assumptions that the data of a fit cannot test.
 
@@ -358,9 +431,11 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
 
 
 RESERVATIONS: tuple[_Check, ...] = (
+    _beyond_limit,
     _unphysical,
     _priors,
     _exponents,
+    _moved_by_outliers,
 )
 """Reasons not to trust a fit although its residuals may look like noise."""
 CHECKS: tuple[_Check, ...] = (
@@ -368,11 +443,13 @@ CHECKS: tuple[_Check, ...] = (
     _parameters,
     _misfit_of_table,
     _misfit_of_records,
+    _weak_elements,
     _of_tables(lambda fit: steady_findings(fit.optimum, fit.model)),
     _clipped,
     _delay,
     _size_of_residuals,
     reading,
     _treatment_of_noise,
+    _few_runs,
     assumptions,
 )

@@ -1,14 +1,15 @@
 """Which model describes the data, and the quantities of friction that do not depend on the model.
 
-Candidates follow from the data: a mean force suggests two limits, several frequencies a damper and
-LuGre's law, any misfit another shape of loop. Each is judged by how it predicts tests that it was
-not fitted to (:mod:`dahl_ident.diagnostics.held_out`). Of those whose density is within one
-standard error of the highest, the simplest is the best. The model fitted stays the best unless
-another's density is higher by more than chance explains among many candidates. AIC and BIC are not
-used: with harmonics whose covariance is tiny they prefer a model that fits the fundamental badly.
-If no model describes the data, the best of them does not either; a model with negative damping does
-not describe a mechanism. Each model is fitted as :func:`dahl_ident.fit` fits it, with the range of
-an exponent that the user did not give.
+Candidates follow from the misfit of the fit: a mean force suggests two limits, a response that
+changes with frequency a damper, a force that falls with it LuGre's law, any other misfit another
+shape of loop. Each is judged by how it predicts tests that it was not fitted to
+(:mod:`dahl_ident.diagnostics.held_out`). Of those whose density is within one standard
+error of the highest, the simplest is the best. The model fitted stays the best unless another's
+density is higher by more than chance explains among many candidates. AIC and BIC are not used: with
+harmonics whose covariance is tiny they prefer a model that fits the fundamental badly. If no model
+describes the data, the best of them does not either; a model with negative damping does not
+describe a mechanism. Each model is fitted as :func:`dahl_ident.fit` fits it, with the range of an
+exponent that the user did not give.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import legendre
+from scipy import special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import TINY, FloatArray
 from dahl_ident.diagnostics.error_model import error_model
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.held_out import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.information import Information, parameter_values, values_at
-from dahl_ident.diagnostics.jenkins_bound import FAR_LESS, least_misfit_of
 from dahl_ident.diagnostics.physics import (
     OF_FRICTION,
     friction_quantities,
@@ -33,6 +35,7 @@ from dahl_ident.diagnostics.physics import (
     negative_elements,
 )
 from dahl_ident.diagnostics.record_channels import RELATIVE_STEP
+from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.verdicts import NOT_IDENTIFIED_ABOVE
 from dahl_ident.elements import (
     Damper,
@@ -53,6 +56,9 @@ from dahl_ident.units import percent
 _RISE_BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
 _ASTRAY = 0.5  # misfit above which a search has failed
 _RATE_RANGE = 1.05  # least ratio of highest to lowest frequency that can show rate dependence
+_GAIN_DEGREE = 8  # degree in ln A of the change of gain that is allowed at every frequency
+_FALL_BY_CHANCE = 1e-4  # rate for a force that falls with the frequency, which adds a candidate
+_DISTINGUISHED = 3.0  # rms difference over noise averaged over all rows, that distinguishes laws
 _RUNAWAY = 100.0  # ratio to the fit's value, above which the data leave a parameter open
 _UNUSUAL = 5.0  # factor beyond the usual range of an exponent that no mechanism has
 _DISAGREE = 0.2  # relative difference of force limits or stiffnesses that matters to the user
@@ -147,6 +153,22 @@ class ComparedModel:
             )
         return quantities | dict.fromkeys(undetermined, np.nan)
 
+    @property
+    def resemblances(self) -> list[str]:
+        """Sentences on elements that these data cannot distinguish from a simpler one."""
+        problem, values = self.optimum.problem, parameter_values(self.optimum)
+        sentences = []
+        for element in problem.model.elements:
+            at_element = [values[p.name] for p in element.parameters]
+            resemblance = element.resembles(at_element, *_levels(problem))
+            if resemblance is not None and resemblance[1] < _DISTINGUISHED * self.density.noise:
+                sentences.append(
+                    f"{self.name}: at these levels it differs from {resemblance[0]} by "
+                    f"{percent(resemblance[1])} rms, too little for these data to distinguish the "
+                    "two."
+                )
+        return sentences
+
 
 @dataclass(frozen=True)
 class ModelComparison:
@@ -170,9 +192,20 @@ class ModelComparison:
         Apart from the one that was fitted, only models count whose parameters are determined and
         physical, and whose force limit and stiffness are below a hundred times those of the fit.
         The model that was fitted is kept where models that the data do not distinguish disagree
-        (`undecided`).
+        (`undecided`), and where a model that the data do not determine has a far smaller misfit
+        (`undetermined`).
         """
-        return self.models[0] if self.undecided else self._simplest
+        return self.models[0] if self.undecided or self.undetermined else self._simplest
+
+    @cached_property
+    def undetermined(self) -> ComparedModel | None:
+        """A physical model with far less misfit than the best, which the data do not determine."""
+        best = self._simplest
+        physical = [model for model in self.models if model.is_physical or model is best]
+        likeliest = max(physical, key=lambda model: model.density.total)
+        gain, error = likeliest.density.gain_over(best.density)
+        far_less = likeliest.density.misfit < FAR_LESS * best.density.misfit
+        return likeliest if far_less and gain > max(error, _RISE_BY_CHANCE) else None
 
     @cached_property
     def undecided(self) -> tuple[ComparedModel, ...]:
@@ -226,6 +259,12 @@ class ModelComparison:
                 f"{simplest.name} and {other.name} would both be better, and these data do not "
                 f"distinguish them: {key} {sizes}. Neither is recommended."
             )
+        if self.undetermined is not None:
+            misfit = percent(self.undetermined.density.misfit)
+            return (
+                f"{self.undetermined.name} would leave far less ({misfit} of {output}), but these "
+                "data do not determine its parameters. No model compared is recommended."
+            )
         if best is first:
             return "No model compared is better than the one fitted."
         gain, error = best.density.gain_over(first.density)
@@ -242,6 +281,7 @@ class ModelComparison:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
         lines.append("Of friction alone, without other elements:")
         lines.append(table([["", *self.common], *self.meanings]))
+        lines += [text for m in self.models for text in m.resemblances]
         lines += [f"{name} could not be fitted: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
 
@@ -379,7 +419,7 @@ def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> Mod
     models : mapping of str to Element, optional
         Models to compare with, by name. By default, in place of a Dahl element: another exponent,
         two elements, two limits (if there are even harmonics), a gap, Bouc-Wen's and Iwan's law,
-        LuGre's if the frequency changes, Maxwell slip if parallel Jenkins elements
+        LuGre's if the force falls with the frequency, Maxwell slip if parallel Jenkins elements
         would leave much less; and in addition to it: a spring, a power damper and, if the frequency
         changes, a mass or a damper.
 
@@ -465,17 +505,10 @@ def _candidates(
         unchanged = e.started_at(at_element) if finite else e
         offers.append((unchanged, e.alternatives(at_element, smallest) if usable else {}))
     reasons = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
-    several, span = True, misfit
     if problem.response is not None:
-        f = problem.response.frequency_hz
-        several = bool(f.max() > _RATE_RANGE * f.min())
-        span += f"; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
-        if not several:
-            span = f"{misfit}; one frequency, so only the amplitude can tell"
-        even = (problem.response.harmonic % 2 == 0).any()
-        reasons["asymmetry"] = "mean force or even harmonics in the data" if even else ""
-        reasons["speed"] = span if several else ""
-        least, reasons["masing"] = least_misfit_of(optimum), ""
+        reasons["asymmetry"] = _even(optimum)
+        reasons["speed"] = _falling_force(optimum)
+        least, reasons["masing"] = least_misfit(optimum), ""
         if least is not None and least < FAR_LESS * fitted.misfit:
             would_leave = f"would leave {percent(least)} of the fundamental"
             reasons["masing"] = f"parallel Jenkins elements {would_leave}"
@@ -499,6 +532,13 @@ def _candidates(
     if not any(is_spring(e) for e in model.elements):
         yield "spring added", misfit, (model, Spring())
     added: list[Element] = []
+    several, span = True, misfit
+    if problem.response is not None:
+        f = problem.response.frequency_hz
+        several = bool(f.max() > _RATE_RANGE * f.min())
+        span += f"; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
+        if not several:
+            span = f"{misfit}; one frequency, so only the amplitude can tell"
     if several:  # at one frequency a mass is a spring
         added += [Mass(), Damper()]
     if several or optimum.loss == "linear":  # outliers at large amplitudes look like a damper
@@ -506,3 +546,53 @@ def _candidates(
     for element in added:
         if all(e.kind != element.kind for e in model.elements):
             yield f"{element.kind.replace('_', ' ')} added", span, (model, element)
+
+
+def _even(optimum: Optimum) -> str:
+    """Return how large the mean force or the even harmonics are; "" if there are none."""
+    data = optimum.problem.data
+    size = np.sqrt(np.mean(np.abs(data.response[data.harmonic == 1]) ** 2))
+    for name, rows in (
+        ("mean force", data.harmonic == 0),
+        ("second harmonic", data.harmonic == 2),
+        ("even harmonics", (data.harmonic % 2 == 0) & (data.harmonic > 2)),
+    ):
+        if rows.any():
+            share = float(np.sqrt(np.mean(np.abs(data.response[rows]) ** 2)) / size)
+            return f"{name} {percent(share)} of the fundamental"
+    return ""
+
+
+def _falling_force(optimum: Optimum) -> str:
+    """Return how far abs(N) over that of the model falls with the frequency; "" if it does not.
+
+    A straight line over ln f is fitted, whose slope is a parabola in ln A, in addition to a smooth
+    dependence on the amplitude.
+    """
+    problem = optimum.problem
+    view, fitted = problem.stiffness_data, problem.predicted_stiffness(optimum.theta).stiffness
+    rows = view.harmonic == 1
+    rate, ln_A = np.log(view.omega[rows]), np.log(view.amplitude[rows])
+    if not np.ptp(rate) > np.log(_RATE_RANGE):
+        return ""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        y = np.log(np.abs(view.stiffness / fitted))[rows]
+    unit_range = 2.0 * (ln_A - ln_A.mean()) / max(float(np.ptp(ln_A)), 1e-9)
+    degree = min(_GAIN_DEGREE, np.unique(ln_A.round(2)).size - 1)
+    smooth = legendre.legvander(unit_range, degree)
+    slopes = legendre.legvander(unit_range, min(2, degree))
+    X = np.hstack([smooth, slopes * (rate - rate.mean())[:, None]])
+    dof, Q = y.size - X.shape[1], slopes.shape[1]
+    if dof < 1 or not np.isfinite(y).all():
+        return ""
+    detrended = y - smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
+    solution = np.linalg.lstsq(X, y, rcond=None)[0]
+    remaining = max(float(np.sum((y - X @ solution) ** 2)), TINY)
+    explained = float(detrended @ detrended) - remaining
+    p = float(special.fdtrc(Q, dof, explained / Q / (remaining / dof)))
+    change = (slopes @ solution[-Q:]) * float(np.ptp(rate))
+    fall = -float(change[np.argmax(np.abs(change))])
+    if not (p < _FALL_BY_CHANCE and fall > 0.0):
+        return ""
+    f = view.omega[rows] / (2.0 * np.pi)
+    return f"force falls by {percent(fall)} from {f.min():.3g} to {f.max():.3g} Hz"

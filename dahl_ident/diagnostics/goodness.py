@@ -1,14 +1,14 @@
 """Goodness of fit: whether residuals are consistent with noise, and estimates physically possible.
 
 Every test that applies is made: chi-square where the noise is known, trends and runs of the
-residuals over amplitude, frequency and drive, the exponent's score (departure from the universal
-curve h(beta)), the third harmonic against the model's. Their joint false-alarm rate is 1 %: the
-level of each test is 1 % divided by the number of tests with at least its p-value (Holm,
-Scandinavian Journal of Statistics 6 (1979) 65). The noise that trends have to exceed includes the
-misfit of the estimate.
+residuals over amplitude, frequency and drive, a stiffness that rises with amplitude, the
+exponent's score (departure from the universal curve h(beta)), the third harmonic against the
+model's. Their joint false-alarm rate is 1 %: the level of each test is 1 % divided by the number of
+tests with at least its p-value (Holm, Scandinavian Journal of Statistics 6 (1979) 65).
+The noise that trends have to exceed includes the misfit of the estimate.
 
-If the model does not describe the data, and the sign of the response is wrong, the verdict begins
-with that (:mod:`dahl_ident.diagnostics.misfit_explanations`).
+If the model does not describe the data, the sign of the response and the suspicious rows are tried
+as causes (:mod:`dahl_ident.diagnostics.misfit_explanations`); the verdict begins with the cause.
 
 A fit may agree with the data and still be physically impossible; this gives a warning
 (:mod:`dahl_ident.diagnostics.physics`).
@@ -26,27 +26,30 @@ from scipy import special
 
 from dahl_ident.arrays import quotient
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, RUNS
-from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import p_text, with_unit
-from dahl_ident.diagnostics.jenkins_bound import FAR_LESS, least_misfit_of
 from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
 from dahl_ident.diagnostics.misfit_explanations import (
+    EXPLAINS,
     SuspiciousPoint,
     flagged_rows,
     is_at_end,
     neighbourhood,
+    refitted_without,
     rms_misfit_of,
     sign_convention,
     suspicious_points,
 )
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
+from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.trends import (
     LEAST_DOF,
     LEAST_RANGE,
     ResidualTest,
     groups,
     runs,
+    stiffening,
     trends,
 )
 from dahl_ident.fitting import Optimum
@@ -54,6 +57,8 @@ from dahl_ident.units import counted, percent
 
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
+_HINT = 0.05  # the same for hints, which do not change the verdict
+_FAR_MORE = 2.0  # scatter over that which the data's covariance states
 _NO_SENSOR = 0.15  # noise over the response, more than any sensor has
 _MEDIAN_SQUARE = 2.0 * np.log(2.0)  # of two normal numbers' sum of squares
 _CLOSE = 0.8  # bound over the misfit, above which no law of this kind helps
@@ -83,6 +88,8 @@ class Goodness:
     # estimated noise over the size of the response; None if the noise's scale is known
     noise_share: float | None = None
     dof: int = 0
+    # scatter about the fit over that of the data's covariance, if the fit did not use it
+    scatter: float | None = None
     suspicious: tuple[SuspiciousPoint, ...] = ()  # points that stand apart
     # whether the amplitudes give no more numbers than friction has free parameters, so that any
     # law fits
@@ -90,7 +97,10 @@ class Goodness:
     rows: int = 0
     fundamentals: int = 0  # rows of the fundamental
     sign: str = ""  # the sign convention that would explain the misfit
-    # where the suspicious rows of a robust fit lie, if side by side, or one at an end
+    apart: tuple[str, ...] = ()  # suspicious rows, where they alone contradict the model
+    verdict_without: str = ""  # how the model describes the data without those rows
+    # where the suspicious rows lie, if they alone depart from the model but are neighbours; for a
+    # robust fit also if a single one is at an end
     neighbours: str = ""
     # least misfit of parallel Jenkins elements, if it helps to explain a misfit
     bound: float | None = None
@@ -126,18 +136,24 @@ class Goodness:
     @cached_property
     def objections(self) -> tuple[str, ...]:
         """Objections to the model, in words with numbers."""
-        return tuple(self._departures())
+        return tuple(self._departures(self.level))
 
-    def _departures(self) -> Iterator[str]:
-        """Yield every departure that counts, the most informative first."""
+    @cached_property
+    def hints(self) -> tuple[str, ...]:
+        """Objections at a level that noise alone reaches in one data set of twenty."""
+        return tuple(self._departures(_HINT / _FALSE_ALARM * self.level))
+
+    def _departures(self, level: float) -> Iterator[str]:
+        """Yield every departure whose p-value is below `level`, the most informative first."""
 
         def clear(kind: str) -> list[ResidualTest]:
-            return [test for test in self.of(kind) if test.p_value < self.level]
+            return [test for test in self.of(kind) if test.p_value < level]
 
         yield from map(str, (*clear("groups"), *self.of("runs differ")))
         departing = clear("trend")
         with_rate = [trend for trend in departing if trend.about == "frequency"]
         yield from (f"{t.brief}, which no rate-independent model can describe" for t in with_rate)
+        yield from map(str, clear("stiffening"))
         if self.beyond_any_sensor and self.noise_share is not None:
             yield (
                 f"the scatter is {percent(self.noise_share)} of the response, "
@@ -180,6 +196,9 @@ class Goodness:
         misfit: dict[str, Any] = {"rms": self.rms_misfit}
         if self.sign:
             yield described("sign", _NOT_DESCRIBED, convention=self.sign)
+        elif self.apart:
+            apart = {"names": self.apart, "rows": self.rows, "remaining": self.verdict_without}
+            yield described("rows_apart", severity, **misfit, **apart)
         elif self.objections:
             yield described(
                 "misfit", severity, **misfit, objections=self.objections, counted=counted
@@ -189,12 +208,14 @@ class Goodness:
         elif self.untested:
             yield described("one_amplitude", _NOT_DETERMINED, **misfit)
         elif not self.objections:
-            yield described("noise", _TRUSTED, **misfit)
+            far_more = self.scatter is not None and self.scatter > _FAR_MORE
+            scatter = self._scatter_in_words if far_more else ""
+            yield described("noise", _TRUSTED, **misfit, hints=self.hints, scatter=scatter)
         if self.flagged:
             every = len(self.flagged) == self.fundamentals
             worst = _NOT_DETERMINED if every else _APPROXIMATE
             yield described("flagged", worst, points=self.flagged, every=every)
-        if self.sign:
+        if self.sign or self.apart:
             return
         if self.suspicious and 2 * len(self.suspicious) < self.rows:  # most rows are not outliers
             names = tuple(point.name for point in self.suspicious)
@@ -206,6 +227,16 @@ class Goodness:
             yield described("jenkins_bound", worst, least=self.bound, law=law)
 
     @property
+    def _scatter_in_words(self) -> str:
+        return f"the scatter is {self.scatter:.2g} times what the data's covariance states"
+
+    @property
+    def cause(self) -> str:
+        """The reason why the model does not describe the data, in words; "" if none is known."""
+        causes = (f for f in self.findings() if f.code in ("sign", "rows_apart"))
+        return next(map(str, causes), "")
+
+    @property
     def headline(self) -> str:
         """Whether the model describes the data, in a few sentences."""
         return " ".join(str(finding) for finding in self.findings())
@@ -214,6 +245,8 @@ class Goodness:
     def details(self) -> list[str]:
         """Every test with its p-value, suspicious points and warnings, a line each."""
         lines = [f"{test} ({p_text(test.p_value)})" for test in self.tests]
+        if self.scatter is not None:
+            lines.append(self._scatter_in_words)
         lines += [f"suspicious: {point}" for point in self.suspicious]
         lines += [f"warning: {text}" for text in self.warnings]
         return lines + [f"flagged in extraction: {text}" for text in self.flagged]
@@ -243,12 +276,37 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     sign = sign_convention(optimum.problem)
     if sign:
         return replace(tested, sign=sign)
+    tested = _without_suspicious(optimum, tested)
     differ = tested.runs_scatter or any(t.p_value < tested.level for t in tested.of("groups"))
     if differ or not tested.objections:
         return tested  # no law describes several devices at once
-    least, misfit = least_misfit_of(optimum), tested.rms_misfit
+    least, misfit = least_misfit(optimum), tested.rms_misfit
     helps = least is not None and (least < FAR_LESS * misfit or _CLOSE * misfit < least <= misfit)
     return replace(tested, bound=least) if helps else tested
+
+
+def _tested_estimate(optimum: Optimum) -> Goodness:
+    """Return the tests of the estimate that belongs to an optimum."""
+    return _tested(optimum, error_model(optimum, of_combinations=True))
+
+
+def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
+    """Return `tested` with the objections that remain without the suspicious rows."""
+    rows = [point.row for point in tested.suspicious]
+    down_weighted = optimum.loss != "linear"
+    if down_weighted or not (rows and tested.objections and not is_at_end(optimum, rows)):
+        return tested
+    optimum_without = refitted_without(optimum, rows)
+    without = None if optimum_without is None else _tested_estimate(optimum_without)
+    if without is None or without.hints or not without.judged:  # hints include objections
+        return tested
+    if not without.rms_misfit * EXPLAINS < tested.rms_misfit:
+        return tested
+    if neighbours := _side_by_side(optimum, tested):
+        return replace(tested, neighbours=neighbours)
+    (remaining,) = (str(f) for f in without.findings() if f.code == "noise")
+    names = tuple(point.name for point in tested.suspicious)
+    return replace(tested, apart=names, verdict_without=remaining)
 
 
 def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
@@ -305,6 +363,7 @@ def _tested(
     chi_square = _chi_square(optimum, space)
     tests = (
         chi_square,
+        stiffening(optimum),
         *groups(optimum, space),
         *trends(optimum, weighted),
         *runs(optimum, space),
@@ -319,6 +378,7 @@ def _tested(
         tuple(test for test in tests if test is not None),
         _noise_share(optimum),
         optimum.dof,
+        _scatter(optimum),
         suspicious=suspicious_points(optimum, space),
         untested=_untested(optimum),
         rows=problem.data.n,
@@ -371,6 +431,14 @@ def _noise_share(optimum: Optimum) -> float | None:
     y = problem.residuals_and_jacobian(optimum.theta)[0][: problem.n_residuals]
     middle = float(np.median(np.sum(y.reshape(-1, 2) ** 2, axis=1)))
     return min(optimum.scale, float(np.sqrt(middle / _MEDIAN_SQUARE))) / size
+
+
+def _scatter(optimum: Optimum) -> float | None:
+    problem = optimum.problem
+    if problem.noise == "measured" or problem.data.covariance is None or optimum.dof <= 0:
+        return None
+    y, _ = problem.like(noise="measured").residuals_and_jacobian(optimum.theta, tails=False)
+    return float(np.sqrt(y @ y / optimum.dof))
 
 
 def _exponent(

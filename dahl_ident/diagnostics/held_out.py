@@ -223,6 +223,8 @@ class PredictiveDensity:
     # without any
     misfit: float
     harmonic_misfit: float
+    # of an average over all fundamentals; NaN for records
+    noise: float = float("nan")
 
     @property
     def total(self) -> float:
@@ -294,8 +296,9 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     square, count = np.abs(deviation) ** 2, int(fundamental.sum()) or 1
     misfit = float(np.sqrt(square[fundamental].sum() / count)) if fundamental.any() else np.nan
     of_harmonics = float(np.sqrt(square[~fundamental].sum() / count))
+    noise = misfit / float(np.sqrt(np.count_nonzero(data.harmonic == 1) or np.nan))
     return PredictiveDensity(
-        tests, run[first], misfit, of_harmonics if not fundamental.all() else np.nan
+        tests, run[first], misfit, of_harmonics if not fundamental.all() else np.nan, noise
     )
 
 

@@ -70,6 +70,13 @@ class Information:
         """Return the standard deviation of directions . theta."""
         return np.sqrt(np.maximum(self.variance(directions), 0.0))  # -eps on a constraint
 
+    def weakest(self, natural: FloatArray) -> FloatArray:
+        """Return the least determined direction of theta/natural, a unit vector, shape (P,)."""
+        information = (self._vectors * np.maximum(self._eigenvalues, 0.0)) @ self._vectors.T
+        lever = self._size * natural
+        vector = np.linalg.eigh(information * np.outer(lever, lever))[1][:, 0]
+        return np.asarray(vector * np.sign(vector[np.argmax(np.abs(vector))]))
+
 
 def shares(optimum: Optimum) -> FloatArray:
     """Return each row's share of the information on each parameter, shape (P, n).

@@ -20,7 +20,8 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.trends import covariates
-from dahl_ident.fitting import Optimum
+from dahl_ident.errors import DahlIdentError
+from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.problem import RecordProblem, TableProblem
 from dahl_ident.problem.record_noise import in_band
 
@@ -29,6 +30,7 @@ _SHARE = 0.1  # of the rows: if more deviate, the model or noise is wrong, not s
 _ONE_BY_ONE = 500  # rows up to which each is removed before the next is judged
 _LEAST_DOF = 4  # without the suspicious rows; fewer do not show the noise
 _GOOD = "good"
+EXPLAINS = 3.0  # factor by which a cause lowers the misfit
 _GIVES_ENERGY = -0.05  # mean sine of the stiffness's phase: a loss of energy makes it positive
 _GIVING = "The mechanism gives energy to its drive, as no friction does"
 _CLUSTER_BY_CHANCE = 0.01  # probability that rows at random lie as close together
@@ -175,6 +177,17 @@ def _work(problem: RecordProblem) -> float:
         force = record.force_samples - record.force_samples.mean()
         work += float(np.trapezoid(force, x))
     return work
+
+
+def refitted_without(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
+    """Return the optimum without some rows; None if there is none."""
+    data = optimum.problem.data
+    kept = ~np.isin(np.arange(data.n), rows)
+    try:
+        refit = solve(optimum.problem.like(data=data.select(rows=kept)), loss=optimum.loss)
+    except DahlIdentError:
+        return None
+    return None if refit.status is Status.NOT_CONVERGED else refit
 
 
 def neighbourhood(optimum: Optimum, rows: Sequence[int]) -> str:

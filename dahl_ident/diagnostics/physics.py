@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy import special
 
+from dahl_ident.arrays import ComplexArray
 from dahl_ident.control_interop import response
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import row_names
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
-from dahl_ident.elements import Element, Friction, Model
-from dahl_ident.elements.parameter import STIFFNESS
+from dahl_ident.elements import Element, Friction, Model, Parameter
+from dahl_ident.elements.facts import Values
+from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status, values_at_bounds
@@ -23,8 +28,11 @@ from dahl_ident.units import engineering, percent, shown_unit, si_unit
 
 _WORTH_STATING = 1e-3  # relative difference that is worth stating
 _DISTORTED = 0.05  # distortion of a force that matters: less changes the fundamental below 1 %
+_OBJECTION_BY_CHANCE = 1e-3  # false-alarm rate, low as such a fit is called physically impossible
 _OFF = 0.02  # relative error of a prediction: as large as a good measurement's
 _CLEARLY = 2.0  # standard uncertainties below zero
+_IMPOSSIBLE = 3.0  # standard errors of a limit by which a force has to exceed it
+_WITH_HARMONICS = 4.0  # a mass at three times the frequency carries nine times as much of a third
 _APPROXIMATE = VerdictStatus.APPROXIMATE
 _FALLING = "fit a law whose force falls with speed (LuGre)"
 _INSTEAD = {
@@ -32,8 +40,16 @@ _INSTEAD = {
     (1, -1, 1): f"a damper: {_FALLING}, leave the damper out, or give its value",
     STIFFNESS: "a spring, except a buckled one: leave it out, or give its value",
 }
-# Range of x_c, m or rad, within which mechanisms lie, from micromachines to bridge bearings.
-_TYPICAL = {"translation": (1e-9, 0.1), "rotation": (1e-7, 1.0)}
+# Ranges in SI units within which mechanisms lie, from micromachines to bridge bearings.
+_TYPICAL = {"x_c": (1e-9, 0.1), "force limit": (1e-9, 1e8), "contact stiffness": (1e-2, 1e12)}
+_TYPICAL_ROTATION = {
+    "x_c": (1e-7, 1.0),
+    "force limit": (1e-10, 1e8),
+    "contact stiffness": (1e-4, 1e12),
+}
+_DIMENSIONS = {FORCE: "force limit", STIFFNESS: "contact stiffness"}
+_RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
+_NEAR_RATIO = 0.05  # largest relative difference from such a ratio
 _TABULATED = 3  # amplitudes at which the energy of a cycle is tabulated
 OF_FRICTION = "force limit", "stiffness at zero force"  # the same in all laws
 Estimates = tuple[Mapping[str, float], Mapping[str, float]]
@@ -131,6 +147,7 @@ def physical_warnings(optimum: Optimum) -> Iterator[str]:
         yield at_bounds or optimum.message  # that of constraints states them
     yield from _not_a_sine(optimum)
     yield from _sizes(optimum)
+    yield from _levels(optimum)
 
 
 def _not_a_sine(optimum: Optimum) -> Iterator[str]:
@@ -147,9 +164,76 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
         )
 
 
+def beyond_friction_limit(
+    optimum: Optimum, scatter: float, ignored: Sequence[int]
+) -> Iterator[Finding]:
+    """Yield where friction would have to exceed its limits, except in the rows `ignored`.
+
+    The fundamental of friction is at most 4/pi times its limit. The peak of a sinusoidal force is
+    at most the limit and what the linear elements carry: a few times their fundamental. Near a
+    resonance, where the fundamentals of mass and spring cancel, they still carry harmonics, by
+    which the fundamental of friction may exceed its limit. `scatter` is the relative standard
+    deviation of the force between runs.
+    """
+    problem, bound, u = optimum.problem, 0.0, 0.0
+    for element, values in _with_values(optimum):
+        if not element.is_linear:
+            bound += float(element.force_bounds(values)[1])
+            forces = (p for p in element.parameters if p.dimension == FORCE)
+            u += sum(optimum.stderr.get(p.name, 0.0) for p in forces)
+    if not 0.0 < bound < np.inf:
+        return
+    limit = 0.25 * np.pi * bound
+    unit, view = shown_unit("N", problem.data.motion), problem.stiffness_data
+    names = partial(row_names, problem.data)
+    friction = friction_stiffness(optimum)
+    size = view.amplitude
+    seen = view.weights > 0.0
+    force = np.where((view.harmonic == 1) & seen, np.abs(friction) * size, np.nan)
+    noise = np.sqrt(2.0) * optimum.scale / np.where(seen, view.weights, np.nan) * size
+    error = np.hypot(noise, scatter * bound)
+    force[ignored] = np.nan
+    excess = np.nan_to_num((force - bound) / error, nan=-np.inf)
+    row, tests = int(np.argmax(excess)), max(np.isfinite(excess).sum(), 1)
+    dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
+    if excess[row] > special.stdtrit(dof, 1.0 - _OBJECTION_BY_CHANCE / tests):
+        shown = {"force": with_unit(force[row], error[row], unit), "limit": f"{bound:.3g} {unit}"}
+        yield described("beyond_slip", _APPROXIMATE, row=names([row])[0], **shown)
+    if problem.data.drive is None:
+        return
+    driven = (problem.data.controlled == "force") & np.isfinite(force)
+    fundamental = np.abs(view.stiffness * problem.sensor_factor(optimum.theta) - friction) * size
+    third = sum(
+        element.stiffness(values, size, 3.0 * view.omega)
+        for element, values in _with_values(optimum)
+        if element.is_linear
+    )
+    harmonics = np.minimum(np.abs(third) * size, bound - limit)
+    carried = np.maximum(_WITH_HARMONICS * fundamental, fundamental + harmonics)
+    beyond = np.where(driven, problem.data.drive - carried - limit, -np.inf)
+    row = int(np.argmax(beyond))
+    if beyond[row] > _IMPOSSIBLE * np.hypot(u, scatter * limit):
+        shown = {"carried": f"{carried[row]:.2g} {unit}", "limit": f"{limit:.3g} {unit}"}
+        yield described("beyond_limit", _APPROXIMATE, row=names([row])[0], **shown)
+
+
 def is_spring(element: Element) -> bool:
     """Return whether an element is a stiffness that depends neither on amplitude nor frequency."""
     return element.is_linear and element.rate_independent
+
+
+def friction_stiffness(optimum: Optimum, *, with_springs: bool = False) -> ComplexArray:
+    """Return the measured dynamic stiffness of friction (and springs), sensors corrected.
+
+    The model's linear elements, with or without springs, are subtracted.
+    """
+    problem = optimum.problem
+    view = problem.stiffness_data
+    linear = np.zeros(len(view.amplitude), dtype=np.complex128)
+    for element, values in _with_values(optimum):
+        if element.is_linear and not (with_springs and is_spring(element)):
+            linear += view.stiffness_of(element, values)
+    return np.asarray(view.stiffness * problem.sensor_factor(optimum.theta) - linear)
 
 
 def friction_quantities(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
@@ -176,6 +260,12 @@ def friction_quantities(problem: Problem, values: Mapping[str, float]) -> dict[s
     }
 
 
+def _with_values(optimum: Optimum) -> Iterator[tuple[Element, Values]]:
+    """Yield every element with the values of its parameters at the optimum."""
+    values, model = parameter_values(optimum), optimum.problem.model
+    yield from model.of([np.asarray(values[p.name]) for p in model.parameters])
+
+
 def is_single(element: Element) -> bool:
     """Return whether an element is a mass, a damper or a spring."""
     return bool(
@@ -186,31 +276,86 @@ def is_single(element: Element) -> bool:
     )
 
 
-def negative_elements(problem: Any, known: Estimates) -> Iterator[Finding]:
-    """Yield a finding for every mass, damping or stiffness clearly below zero, with what to do."""
+def _estimated_singles(
+    problem: Any, known: Estimates
+) -> Iterator[tuple[Element, Parameter, dict[str, Any]]]:
+    """Yield every mass, damper and spring that is estimated, with its parameter and estimate."""
     values, stderr = known
     for element in problem.model.elements:
-        p = element.parameters[0]
-        if not (is_single(element) and p.free):
-            continue
-        value, u = values[p.name], stderr[p.name]
-        if np.isfinite(value) and value < -_CLEARLY * u:
-            estimate = {"value": value, "stderr": u, "unit": shown_unit(p.unit, problem.motion)}
-            instead = _INSTEAD[p.dimension]
-            yield described("negative", _APPROXIMATE, name=p.name, **estimate, instead=instead)
+        if is_single(element) and element.parameters[0].free:
+            (parameter,) = element.parameters
+            name = parameter.name
+            unit = shown_unit(parameter.unit, problem.motion)
+            estimate = {"value": values[name], "stderr": stderr[name], "unit": unit}
+            yield element, parameter, {"name": name, **estimate}
+
+
+def negative_elements(problem: Any, known: Estimates) -> Iterator[Finding]:
+    """Yield a finding for every mass, damping or stiffness clearly below zero, with what to do."""
+    for _, parameter, estimate in _estimated_singles(problem, known):
+        value, instead = estimate["value"], _INSTEAD[parameter.dimension]
+        if np.isfinite(value) and value < -_CLEARLY * estimate["stderr"]:
+            yield described("negative", _APPROXIMATE, **estimate, instead=instead)
+
+
+def weak_elements(
+    problem: Any,
+    known: Estimates,
+    share_of: Callable[[Element, float], float],
+    misfit_within: float,
+    misfit: float,
+) -> Iterator[Finding]:
+    """Yield a finding for every mass, damper or spring whose force is smaller than the misfit.
+
+    `share_of` returns the rms force of an element at its value over the whole force, which is
+    compared with `misfit_within`, that within runs; the finding states the whole `misfit`.
+    """
+    for element, _, estimate in _estimated_singles(problem, known):
+        share = share_of(element, estimate["value"])
+        if share < misfit_within and estimate["value"] >= -_CLEARLY * estimate["stderr"]:
+            yield described("slight", **estimate, share=share, misfit=misfit)
 
 
 def _sizes(optimum: Optimum) -> Iterator[str]:
-    """Yield every x_c that no mechanism has."""
+    """Yield force limits, contact stiffnesses and x_c that no mechanism has."""
     motion, values = optimum.problem.data.motion, parameter_values(optimum)
-    least, most = _TYPICAL[motion]
+    typical = _TYPICAL if motion == "translation" else _TYPICAL_ROTATION
     for element in optimum.problem.model.elements if optimum.success else ():
-        low, high = element.knee([np.asarray(values[p.name]) for p in element.parameters])
-        if low == high and np.isfinite(low) and not least <= low <= most:
-            size, least_size, most_size = (
-                engineering(float(v), shown_unit("m", motion)) for v in (low, least, most)
-            )
+        at_element = [float(values[p.name]) for p in element.parameters]
+        sizes = [
+            (p.name, p.unit, _DIMENSIONS[p.dimension], value)
+            for p, value in zip(element.parameters, at_element, strict=True)
+            if element.has_memory and p.free and p.dimension in _DIMENSIONS
+        ]
+        if sizes:
+            low, high = element.knee([np.asarray(v) for v in at_element])
+            sizes += [("x_c", "m", "x_c", float(low))] * bool(low == high)
+        for name, unit, kind, value in sizes:
+            least, most = typical[kind]
+            if np.isfinite(value) and not least <= value <= most:
+                size, low, high = (
+                    engineering(v, shown_unit(unit, motion)) for v in (value, least, most)
+                )
+                yield (
+                    f"{name} is {size}, where mechanisms have {low} to {high}: check the units of "
+                    "displacement and force"
+                )
+
+
+def _levels(optimum: Optimum) -> Iterator[str]:
+    """Yield that amplitudes are not zero-to-peak values, if nominal levels show it."""
+    data = optimum.problem.data
+    driven = bool((data.controlled == "force").all())
+    size = data.drive if driven else data.amplitude
+    if size is None or data.level is None or data.level.dtype.kind not in "if":
+        return
+    level = np.asarray(data.level, dtype=np.float64)
+    if not (level > 0.0).all() or np.ptp(level) == 0.0:
+        return
+    ratio = size / level
+    for wrong, name in _RATIOS.items():
+        if np.all(np.abs(ratio / wrong - 1.0) < _NEAR_RATIO):
             yield (
-                f"x_c is {size}, where mechanisms have {least_size} to {most_size}: check the "
-                "units of displacement and force"
+                f"every {'drive' if driven else 'amplitude'} is {np.median(ratio):.3g} times its "
+                f"nominal level: {name} values, where zero-to-peak is meant?"
             )

@@ -43,7 +43,7 @@ from dahl_ident.diagnostics.verdicts import (
     Verdict,
     within,
 )
-from dahl_ident.elements import Model, Parameter
+from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.losses import loss_named
@@ -314,7 +314,7 @@ class RecordAssessment(Assessment):
             _, shown, _ = limits[name]
             text, reason = within(shown, unit), why.get(name, "")
             parameters[name] = ParameterVerdict(name, unit, verdict, shown, text, reason)
-        return Identifiability(parameters, ())
+        return Identifiability(parameters, (), {})
 
     @property
     def constraint_cost(self) -> ConstraintCost | None:
@@ -325,7 +325,7 @@ class RecordAssessment(Assessment):
 
     @cached_property
     def goodness(self) -> RecordGoodness:
-        """Statistics of the residuals, and whether the force's sign is wrong."""
+        """Statistics of the residuals, and whether the force's sign explains them."""
         goodness = record_goodness(self.problem, self.residuals)
         if goodness.rms_in_band < _LARGE:
             return goodness
@@ -345,12 +345,32 @@ class RecordAssessment(Assessment):
                 u, limits = value * p.log_ratio_std, p.range if p.assumed else None
                 yield ContradictedExponent(p.name, p.value, value, u, limits)
 
+    @property
+    def significant_misfit(self) -> tuple[float, float] | None:
+        """The misfit, within runs and in all; None if there is none, or the output is a motion."""
+        if self.problem.output == "motion" or not self.exceeds_noise:
+            return None
+        return (self.goodness.rms_in_band,) * 2
+
+    def force_share(self, element: Element, value: float) -> float:
+        """Return the rms force of an element of one parameter, over that of the records."""
+        size = np.concatenate([y - y.mean() for y in self.problem.measured]).std()
+        force = [
+            element.force_history([value], x, v, acceleration=a) for x, v, a in self.problem.motions
+        ]
+        return float(np.concatenate([f - f.mean() for f in force]).std() / size)
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.errors.runs
+
     def design(self, *, counted: bool) -> dict[str, Any]:
         """Return what is assumed because of the number of records, or is not known."""
         exponents = self.problem.exponents
         unseen = [p.name for p in exponents if p.assumed and p.name not in self.assumed]
         unfound = tuple(unseen) if counted and not self.first_order else ()
-        return {"single_run": self.errors.runs < 2, "unfound": unfound}
+        return {"single_run": self.runs < 2, "unfound": unfound}
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -16,7 +16,9 @@ A force limit that differs by 5 % from day to day bends the response by second-o
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +110,80 @@ def run_deviations(
     return RunDeviations(labels, centre + b, scatters)
 
 
-class ResidualSpace:
+class Coefficient(NamedTuple):
+    """How far the data depart along one column, with its standard error."""
+
+    value: float
+    stderr: float
+
+
+class _Complement(ABC):
+    """Residuals orthogonal to the Jacobian's columns, and changes to compare them with."""
+
+    residuals: FloatArray
+    basis: FloatArray
+    scale: float = 1.0  # standard deviation of one residual
+
+    @abstractmethod
+    def _raw(self, changes: ComplexArray) -> FloatArray:
+        """Return the columns (k, m) of relative changes (k, n) of the predicted responses."""
+
+    def columns(self, changes: ComplexArray) -> FloatArray:
+        """Return the columns (k, m) of relative changes (k, n) of the predicted responses.
+
+        The part that the parameters explain is removed; a column that they explain whole is zero.
+        The sign is that of the data: positive where data exceed the model.
+        """
+        columns = self._raw(changes)
+        before = np.linalg.norm(columns, axis=-1, keepdims=True)
+        for _ in range(2):
+            columns = columns - (columns @ self.basis) @ self.basis.T
+        after = np.linalg.norm(columns, axis=-1, keepdims=True)
+        return np.where(after > _LEFT * before, columns, 0.0)
+
+    def coefficient(self, change: ComplexArray) -> Coefficient:
+        """Return the coefficient of one relative change of the response, shape (n,)."""
+        (column,) = self.columns(change[None])
+        square = float(column @ column)
+        if square == 0.0:
+            return Coefficient(0.0, np.inf)
+        return Coefficient(float(column @ self.residuals) / square, self.scale / square**0.5)
+
+    def fitted(self, changes: ComplexArray) -> ComplexArray:
+        """Return the relative departure of the data, shape (n,), that `changes` (k, n) explain."""
+        columns = self.columns(changes)
+        gamma = np.linalg.lstsq(columns.T, self.residuals, rcond=_RANK)[0]
+        return np.asarray(gamma @ changes)
+
+
+class RelativeSpace(_Complement):
+    """ln(R/R_model) of fundamentals with equal weights, which shows the size of a departure.
+
+    The weights do not depend on the noise model, so that a departure of 30 % reads as 30 % even
+    where the data claim errors of 1 %. Rows in which R or R_model is 0 are left out.
+    """
+
+    def __init__(self, optimum: Optimum) -> None:
+        problem, theta = optimum.problem, optimum.theta
+        predicted = problem.predict(theta)
+        nonzero = (problem.data.response != 0.0) & (predicted != 0.0)
+        self._rows = (problem.data.harmonic == 1) & nonzero
+        with np.errstate(divide="ignore", invalid="ignore"):
+            y = np.log(problem.data.response / predicted)[self._rows]
+            J = (problem.prediction_jacobian(theta) / predicted[:, None])[self._rows]
+        J = J[:, [name not in problem.ranges for name in problem.names]]  # assumed ones are fixed
+        self.basis = orthonormal(np.concatenate([J.real, J.imag]))
+        r = np.concatenate([y.real, y.imag])
+        self.residuals = r - self.basis @ (self.basis.T @ r)
+        dof = r.size - self.basis.shape[1]
+        self.scale = float(np.sqrt(self.residuals @ self.residuals / max(dof, 1)))
+
+    def _raw(self, changes: ComplexArray) -> FloatArray:
+        of_rows = changes[:, self._rows]
+        return np.concatenate([of_rows.real, of_rows.imag], axis=-1)
+
+
+class ResidualSpace(_Complement):
     """Residuals of an optimum in units of the noise, which show if a departure is significant."""
 
     def __init__(
@@ -169,28 +244,11 @@ class ResidualSpace:
         weight = np.sqrt((nu + 1.0) * (nu - 1.0) / (nu * (nu + 3.0)))
         return weight, np.sqrt((nu - 1.0) * np.log1p(z / nu) / z)
 
-    def columns(self, changes: ComplexArray) -> FloatArray:
-        """Return the columns (k, m) of relative changes (k, n) of the predicted responses.
-
-        The part that the parameters explain is removed; a column that they explain whole is zero.
-        The sign is that of the data: positive where data exceed the model.
-        """
-        predicted = self._problem.predict(self._optimum.theta)
-        columns = self._problem.residual_change(self._optimum.theta, changes * predicted)
-        columns = -columns / self._scale * self._column_weight
-        before = np.linalg.norm(columns, axis=-1, keepdims=True)
-        for _ in range(2):
-            columns = columns - (columns @ self.basis) @ self.basis.T
-        after = np.linalg.norm(columns, axis=-1, keepdims=True)
-        return np.where(after > _LEFT * before, columns, 0.0)
-
-    def coefficient(self, change: ComplexArray) -> tuple[float, float]:
-        """Return how far the data depart along a relative change (n,), and its standard error."""
-        (column,) = self.columns(change[None])
-        square = float(column @ column)
-        if square == 0.0:
-            return 0.0, np.inf
-        return float(column @ self.residuals) / square, 1.0 / square**0.5
+    def _raw(self, changes: ComplexArray) -> FloatArray:
+        theta = self._optimum.theta
+        predicted = self._problem.predict(theta)
+        columns = -self._problem.residual_change(theta, changes * predicted) / self._scale
+        return np.asarray(columns * self._column_weight)
 
     def p_value(self, changes: ComplexArray) -> float:
         """Return the probability that noise alone departs so far along `changes`, (k, n)."""

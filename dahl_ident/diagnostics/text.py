@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from string import Formatter
 from typing import Any
 
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, coverage_factor, level_text
 from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.errors import argument, spelled
 from dahl_ident.units import counted, percent
@@ -81,6 +81,29 @@ def _undetermined(determined: Sequence[str], weak: Sequence[str], lost: Sequence
 
 
 # Described?
+
+
+def _noise(rms: float, hints: Sequence[str], scatter: str) -> str:
+    hint = f", with a hint that {joined(hints)}" if hints else ""
+    but = f", but {scatter}" if scatter else ""
+    return f"The residuals are consistent with noise ({percent(rms)} rms misfit){hint}{but}."
+
+
+def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> str:
+    which = joined(names, _MOST_ROWS)
+    them, these, named = (
+        "them",
+        "these rows",
+        f"Only {len(names)} of {counted(rows, 'row')} ({which}) contradict",
+    )
+    if len(names) == 1:
+        them, these, named = "it", "this row", f"Only the row at {names[0]} contradicts"
+    left = remaining[0].lower() + remaining[1:].rstrip(".")
+    return (
+        f"{named} the model ({percent(rms)} rms misfit): without {them} {left}. The fit includes "
+        f"{these}: check {them}, or fit with {argument('loss', 'huber')}, which down-weights "
+        f"{them}."
+    )
 
 
 def _jenkins_bound(least: float, law: bool) -> str:
@@ -172,6 +195,7 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
         f"judge {'the model' if scale_known else 'noise and model'}: measure more points."
     ),
     "sign": "{convention}. Do not use the numbers of this fit.",
+    "rows_apart": _rows_apart,
     "misfit": lambda rms, objections, counted: (
         (
             f"The stated uncertainties include a misfit of {percent(rms)} rms: "
@@ -189,11 +213,12 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     ),
     "one_amplitude": "One amplitude gives no more numbers than friction has parameters, so any "
     "model fits ({rms:percent} rms misfit): measure at other amplitudes as well.",
-    "noise": "The residuals are consistent with noise ({rms:percent} rms misfit).",
+    "noise": _noise,
     "suspicious": lambda names, neighbours: (
         f"Suspicious rows: {joined(names, _MOST_ROWS)}; "
         + (
-            f"{neighbours}: check them, or the model is wrong there."
+            f"without them the model describes the data, but {neighbours}: check them, or the "
+            "model is wrong there."
             if neighbours
             else "check them (a robust loss down-weights these rows)."
         )
@@ -204,6 +229,10 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
         f"fitted ({joined(points, 1)}): measure them again"
         f"{'' if every else ', or select the good ones'}."
     ),
+    "beyond_limit": "At {row} the force held exceeds friction's limit ({limit}) by more than the "
+    "other elements carry ({carried}): the limit is wrong, or an element is missing.",
+    "beyond_slip": "At {row} friction's fundamental is {force}, more than full slip can give "
+    "({limit}): an element is missing.",
     "held_out": lambda tests, available, gains, phases, rows, width: (
         f"Without each of {tests}{f' of {available}' * (tests != available)} tests in turn, "
         f"{gains} of {rows} held-out gains and {phases} of {rows} phases of fundamentals are "
@@ -225,9 +254,18 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
         f"assumed ({low:g} to {high:g}): estimate it ({spelled(f'{name}=None', f'{name}=free')}), "
         "or use another law."
     ),
+    "moved": lambda names, rows: (
+        f"A robust fit moves {listed(names)} by more than one standard uncertainty: check the "
+        f"{'suspicious rows' if rows else 'rows with the largest residuals'}, or fit with "
+        f"{argument('loss', 'huber')}."
+    ),
     "negative": lambda name, value, stderr, unit, instead: (
         f"{name} is negative ({with_unit(value, stderr or None, unit)}), as of no device: it "
         f"stands for what the model lacks, and is not {instead}."
+    ),
+    "slight": lambda name, value, stderr, unit, share, misfit: (
+        f"{name} = {with_unit(value, stderr, unit)} rests on {percent(share)} rms of the force, "
+        f"less than the model misses ({percent(misfit)}): give it, or leave it out."
     ),
     "steady": "The force was held, and the exact steady motion fitted; the describing function "
     "would be up to {difference:percent} off, at {row}.",
@@ -295,5 +333,10 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "evidence": "ln evidence: {ln:.4f}",
     "warning": "Warning on reading: {text}.",
     "more_warnings": lambda count: f"{counted(count, 'more warning')} on reading.",
+    "few_runs": lambda k, runs: (
+        f"The scatter of {runs} runs has {counted(runs - 1, 'degree of freedom')}, so the coverage "
+        f"factor k is up to {k:.3g}"
+        + (f"; with another run, about {less:.2g}." if (less := coverage_factor(runs)) < k else ".")
+    ),
     "assumed": _assumed,
 }

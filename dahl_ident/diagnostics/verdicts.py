@@ -11,7 +11,8 @@ tenth of the size at which they would make up the whole response, whichever size
 parameters of records are judged to first order, and are not identified above 0.3.
 
 Where parameters are not identified, combinations of them may be
-(:mod:`dahl_ident.diagnostics.budget`).
+(:mod:`dahl_ident.diagnostics.budget`); where no known combination fits, the least
+determined direction is given as a vector.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.advice import advice
 from dahl_ident.diagnostics.bands import DerivedQuantity
-from dahl_ident.diagnostics.budget import ParameterBudget, candidates
+from dahl_ident.diagnostics.budget import ParameterBudget, candidates, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, coverage_factor, level_text, thresholds
 from dahl_ident.diagnostics.contributions import EXPONENT, MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -61,6 +62,7 @@ _NO_DIFFERENCE = 1.0  # of -2 ln L, between two values that are equally likely
 _DIFFERENT = 9.0  # of -2 ln L, to first order: parameters that differ by 3 u
 _MOST_EXCHANGED = 6  # parameters exchanged at once, in pairs
 _MEASURE_EVEN = "measure the mean force or even harmonics too"
+_VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
 class Verdict(Enum):
@@ -124,6 +126,9 @@ class Identifiability:
 
     parameters: Mapping[str, ParameterVerdict]
     combinations: tuple[DerivedQuantity, ...]  # determined ones, of parameters that are not
+    # where no combination is known: the least determined direction in the parameters' logarithms
+    # (in sizes that matter for those that have none)
+    direction: Mapping[str, float]
 
     def named(self, verdict: Verdict) -> list[str]:
         """Return the names of the parameters with this verdict."""
@@ -171,6 +176,9 @@ class Identifiability:
     def __str__(self) -> str:
         lines = [self.headline, *(f"- {p.text}" for p in self.parameters.values())]
         lines += [f"- determined: {combination}" for combination in self.combinations]
+        if self.direction:
+            vector = ", ".join(f"{name} {value:+.2f}" for name, value in self.direction.items())
+            lines.append(f"- undetermined direction, in logarithms: {vector}")
         return "\n".join(lines)
 
 
@@ -203,7 +211,7 @@ def judged(
     texts are those of `stated`, and determined combinations those of the budget's `sources`.
     Without profiles, or where none is needed, the verdicts are first order.
     """
-    problem = optimum.problem
+    information, problem = Information(optimum), optimum.problem
     natural = natural_sizes(optimum)
     fisher = np.sqrt(np.diagonal(optimum.covariance)) / natural
     if profile_of is None or np.all(fisher < _NEARLY_LINEAR):
@@ -240,6 +248,12 @@ def judged(
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
     loose = lost | {n for n, v in verdicts.items() if v is Verdict.WEAK}
     determined = list(_combinations(optimum, sources, lost, loose))
+    seen = None if determined else stiffness_seen(optimum)
+    if seen is not None and seen.members <= loose and np.isfinite(seen.value):
+        std = float(information.std(seen.direction))
+        if std < IDENTIFIED_BELOW:
+            u = abs(seen.value) * std
+            determined.append(DerivedQuantity(seen.expression, seen.unit, None, seen.value, u))
     parameters = {}
     for name, parameter in zip(problem.names, problem.parameters, strict=True):
         unit = parameter.unit
@@ -253,7 +267,13 @@ def judged(
         elif verdicts[name] is Verdict.NOT_IDENTIFIED:
             why = advice(optimum, name, widest, lost)
         parameters[name] = ParameterVerdict(name, unit, verdicts[name], limits, shown, why)
-    return Identifiability(parameters, tuple(determined))
+    direction = {}
+    if lost - ambiguous.keys() and not determined:
+        vector = information.weakest(natural)
+        parts = zip(problem.names, vector.tolist(), strict=True)
+        direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
+        direction = direction if len(direction) > 1 else {}
+    return Identifiability(parameters, tuple(determined), direction)
 
 
 def _lost_beyond_noise(

@@ -125,6 +125,7 @@ class Dahl(Friction):
         0.0,
     )
     scale_parameters = ("f_max", "sigma")
+    softens = True
 
     def __init__(
         self,

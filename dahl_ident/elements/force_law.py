@@ -58,6 +58,8 @@ class ForceLaw(ABC):
         Labels of parameters: if all are multiplied by one factor, so is the force.
     like_parts : tuple of tuple of str
         Labels of each of several interchangeable parts; estimates are ordered by the first label.
+    softens : bool
+        True: Re N falls with the amplitude, whatever the values.
     holds_at_rest : bool
         True: holding a constant displacement may take a force.
     starts : tuple of (str, str, str)
@@ -75,6 +77,7 @@ class ForceLaw(ABC):
     linear_parameters: tuple[str, ...] = ()
     scale_parameters: tuple[str, ...] = ()
     like_parts: tuple[tuple[str, ...], ...] = ()
+    softens: bool = False
     holds_at_rest: bool = True
     starts: tuple[tuple[str, str, str], ...] = (
         ("initial_force", "N", "friction at the first sample"),
@@ -311,6 +314,15 @@ class ForceLaw(ABC):
 
     def universal_curve(self) -> UniversalCurve | None:
         """Return the curve that N follows for all values of the scale parameters, or None."""
+        return None
+
+    def resembles(
+        self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[str, float] | None:
+        """Return a simpler law, if there is one, and the rms deviation of its best fit to this N.
+
+        The deviation is relative, over levels of `amplitude` and `omega`.
+        """
         return None
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:

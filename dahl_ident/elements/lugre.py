@@ -49,8 +49,8 @@ class LuGre(Friction):
     C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems
     with friction, IEEE Trans. Autom. Control 40 (1995) 419-425. N depends on the frequency. Where
     all peak speeds are far above or far below `stribeck_speed`, or `static_ratio` is near 1,
-    settled sines cannot distinguish it from linear Dahl with a damper. The initial force
-    of a history is that of the bristles.
+    settled sines cannot distinguish it from linear Dahl with a damper: see `distance_from_dahl`.
+    The initial force of a history is that of the bristles.
 
     Examples
     --------
@@ -132,3 +132,53 @@ class LuGre(Friction):
                 static,
             ),
         )
+
+    def resembles(
+        self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[str, float] | None:
+        """Return linear Dahl with a damper, and the distance from it."""
+        if not np.all(np.isfinite(values)):
+            return None
+        pairs = zip(self.parameters, values, strict=True)
+        law = LuGre(*(p.nearest(value) for p, value in pairs), name=self.name)
+        return "linear Dahl with a damper", law.distance_from_dahl(amplitude, omega)
+
+    def distance_from_dahl(self, amplitude: FloatArray, omega: FloatArray) -> float:
+        """Return the misfit to this law's N of the linear Dahl law with a damper that fits best.
+
+        Parameters
+        ----------
+        amplitude, omega : ndarray
+            The levels, m and rad/s; broadcast.
+
+        Returns
+        -------
+        float
+            Root mean square of abs(N_Dahl/N - 1). Settled sines with more noise than this cannot
+            distinguish the two laws.
+
+        Examples
+        --------
+        >>> law = LuGre(1.0, 100.0, 1.5, 0.01)
+        >>> A = np.geomspace(1e-3, 1e-1, 9)
+        >>> print(f"{law.distance_from_dahl(A, np.asarray(100.0)):.2f}")
+        0.00
+        """
+        from scipy.optimize import least_squares
+
+        from dahl_ident.elements.linear_dahl import describing_function
+
+        A, w = (np.asarray(v, dtype=np.float64) for v in np.broadcast_arrays(amplitude, omega))
+        values = self.known_values()
+        N = self.stiffness(values, A, w)
+
+        def deviation(p: FloatArray) -> FloatArray:
+            f_max, sigma, damping = np.exp(p)
+            dahl = sigma * describing_function(sigma * A / f_max) + 1j * w * damping
+            relative = (dahl / N - 1.0).ravel()
+            return np.asarray(np.concatenate([relative.real, relative.imag]) / np.sqrt(A.size))
+
+        f_max, sigma, ratio = (float(v) for v in values[:3])
+        damping = max(float(values[5]), 1e-9 * f_max / float(np.max(A * w) or 1.0))
+        starts = [np.log([f, sigma, damping]) for f in (f_max, f_max * ratio)]
+        return min(float(np.linalg.norm(least_squares(deviation, s).fun)) for s in starts)

@@ -48,8 +48,9 @@ class MaxwellSlip(Masing):
     Notes
     -----
     Many elements can describe any symmetric rate-independent law that has no memory at full slip (a
-    Masing law). At an amplitude equal to a slip displacement, where N has a kink, derivatives are
-    those below it.
+    Masing law). To find such a law from data, see
+    ``dahl_ident.diagnostics.slip_density.slip_density``. At an amplitude equal to a slip
+    displacement, where N has a kink, derivatives are those below it.
 
     Examples
     --------

@@ -199,8 +199,7 @@ def fit(
     if cause := problem.why_not_finite(optimum.residuals):
         raise FitError(cause)
     if throw and not result.success:
-        cause = f"{result.goodness.sign}. " if result.goodness.sign else ""
-        raise FitError(f"{cause}{result.message}", result)
+        raise FitError(f"{result.goodness.cause} {result.message}".strip(), result)
     return result
 
 
