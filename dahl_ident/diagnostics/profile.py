@@ -23,6 +23,8 @@ from functools import cached_property
 import numpy as np
 
 from dahl_ident.arrays import EPS, BoolArray, FloatArray, IntArray, unit_diagonal
+from dahl_ident.elements import Parameter
+from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, microslip_charts
 from dahl_ident.fitting.global_start import edge_starts
@@ -51,6 +53,9 @@ _FAR, _FEW_STEPS = float(np.log(100.0)), 3  # distance of a logarithm, and steps
 _FARTHEST_LINEAR = 1e6  # conditional standard errors, if the parameter is not a logarithm
 _FARTHEST_LOG = 80.0  # distance of a logarithm from the optimum
 _FARTHEST_RATIO = 4.0  # the same of a pure number: an exponent or a gain
+_LEAST_X_C = 1e-14  # over the smallest amplitude
+_MOST_X_C, _MOST_X_C_WITH_SPRING = 1e8, 1e5  # over the largest, alone and in parallel with a spring
+_SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
 
 
 class Bracket:
@@ -191,6 +196,7 @@ class Profiler:
         """Return where the profile of parameter `index` meets `target` on the side of `sign`."""
         theta = np.tile(self._optimum.theta, (len(index), 1))
         tangent, origin = self._tangents[index], self._optimum.theta[index]
+        was_reachable = np.zeros(len(index), dtype=np.bool_)
         furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
         step, width = self._first_step[index] * target, _NARROW * self._conditional[index]
         bracket = Bracket(target, step, furthest, self._logarithmic[index], width)
@@ -199,10 +205,11 @@ class Profiler:
             moved = sign[a] * bracket.position[a] + origin[a] - theta[a, index[a]]
             at = self._from_best_start(index[a], theta[a], self._along(tangent[a], moved))
             root = np.sqrt(np.maximum(at.deviance, 0.0))
-            far = bracket.position[a] >= self._farthest[index[a]]
+            reachable = self._reachable(at.theta, index[a], bracket.position[a])
+            was_reachable[a] |= reachable
             with np.errstate(divide="ignore", invalid="ignore"):
                 slope = sign[a] * at.slope / root
-            below = bracket.narrow(root, slope, far)
+            below = bracket.narrow(root, slope, was_reachable[a] & ~reachable)
             theta[a[below]], tangent[a[below]] = at.theta[below], at.tangent[below]
             if not bracket.active.size:
                 break
@@ -391,10 +398,48 @@ class Profiler:
         below = (values == -np.inf) | (self._logarithmic & (values == 0.0))
         return np.array([below | flat, (values == np.inf) | flat])
 
+    def _reachable(self, theta: FloatArray, index: IntArray, position: FloatArray) -> BoolArray:
+        """Return whether the model still changes farther out."""
+        near = position < self._farthest[index]
+        columns = dict(zip(self._problem.names, theta.T, strict=True))
+        for f_max, sigma in self._friction:
+            of_friction = np.isin(np.array(self._problem.names)[index], (f_max.name, sigma.name))
+            ln_f_max, ln_sigma = (np.asarray(columns.get(p.name, _ln(p))) for p in (f_max, sigma))
+            ln_x_c = ln_f_max - ln_sigma
+            least, most, softest, stiffest = self._reach
+            matters = (ln_x_c > least) & (ln_x_c < most) & (ln_sigma > softest)
+            cancels = (ln_sigma > stiffest) & (ln_x_c > self._smallest)
+            near &= ~of_friction | (matters & ~cancels)
+        return near
+
+    @cached_property
+    def _friction(self) -> list[tuple[Parameter, Parameter]]:
+        """Force limit and stiffness of every law whose scale parameters these two are."""
+        pairs: list[tuple[Parameter, Parameter]] = []
+        for element in self._problem.model.elements if self._problem.response is not None else ():
+            scale = {element.parameter(s).dimension: s for s in element.scale_parameters}
+            if element.has_memory and {*scale} == {FORCE, STIFFNESS}:
+                force, stiffness = scale[FORCE], scale[STIFFNESS]
+                pairs.append((element.parameter(force), element.parameter(stiffness)))
+        return pairs
+
     @cached_property
     def _smallest(self) -> float:
         """Logarithm of the smallest amplitude; an x_c above it is microslip."""
         return float(np.log(self._problem.stiffness_data.amplitude.min()))
+
+    @cached_property
+    def _reach(self) -> FloatArray:
+        """Ends of ln x_c, then of ln sigma, beyond which friction is at a limit.
+
+        Friction stiffer than the last, in microslip, is almost cancelled by a negative spring.
+        """
+        view = self._problem.stiffness_data
+        stiffness = view.typical_stiffness
+        has_spring = any(e.is_linear and e.holds_at_rest for e in self._problem.model.elements)
+        low, high = view.amplitude.min(), view.amplitude.max()
+        most = _MOST_X_C_WITH_SPRING if has_spring else _MOST_X_C
+        return np.log([low * _LEAST_X_C, high * most, stiffness * _SOFTEST, stiffness * _STIFFEST])
 
     @cached_property
     def _farthest(self) -> FloatArray:
@@ -484,3 +529,7 @@ def _tangent(hessian: FloatArray, index: IntArray) -> FloatArray:
     size = np.where(size > 0.0, size, 1.0)
     scaled = H / (size[:, :, None] * size[:, None, :]) + 1e-12 * np.eye(P)
     return np.asarray(np.linalg.solve(scaled, (b / size)[:, :, None])[:, :, 0] / size)
+
+
+def _ln(parameter: Parameter) -> float:
+    return float("nan") if parameter.value is None else float(np.log(parameter.value))
