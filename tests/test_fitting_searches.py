@@ -8,8 +8,8 @@ from scipy.signal import lfilter
 import dahl_ident as di
 from dahl_ident.fitting import Status, solve
 from dahl_ident.fitting.global_start import global_starts
-from dahl_ident.fitting.levenberg_marquardt import minimise
-from dahl_ident.fitting.record_search import noise_power
+from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
+from dahl_ident.fitting.record_search import RecordSearch, noise_power
 from dahl_ident.problem import Quadratic, RecordProblem, TableProblem
 from tests import cold_records as cold
 from tests.random_problems import friction_and_spring
@@ -135,6 +135,27 @@ def test_limits_are_found_in_few_evaluations():
     ends = [solve(problem) for problem, *_ in friction_and_spring(seed=5, count=12)]
     assert sum(end.status.at_infinity for end in ends) == 3
     assert sum(end.nfev for end in ends) < 360
+
+
+class Stuck(RecordSearch):
+    """A search whose steps do not lower the cost."""
+
+    def minimise(self, problem, begin, most):
+        cost, _, hessian = problem.quadratic(begin)
+        return Minima(begin, cost, hessian, np.array([False]), np.array([1]))
+
+
+@pytest.mark.parametrize(("errors", "ends"), [(0.18, True), (0.22, False)])
+def test_a_search_that_is_stuck_ends_within_a_fifth_of_the_standard_error(errors, ends):
+    rng = np.random.default_rng(0)
+    x = np.cumsum(rng.standard_normal(400))
+    force = 5.0 * x + rng.standard_normal(400)
+    record = di.Record(np.arange(400) / 100.0, displacement=x, force=force)
+    problem = RecordProblem([record], di.Spring())
+    best = solve(problem)
+    off = errors * best.covariance[0] / best.covariance[0, 0] ** 0.5
+    end = Stuck("lm", "linear").descend(problem, best.theta + off, 75)
+    assert end.converged[0] == ends
 
 
 @pytest.mark.parametrize(

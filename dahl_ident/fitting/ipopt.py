@@ -62,12 +62,19 @@ _EASING = 0.1  # factor on the damping after a step that lowers the cost
 _LEAST_RESIDUAL = 1e-4
 _MOST_STARTS = 6  # of the global grid and the user
 _SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-_INFEASIBLE = "infeasible problem detected"
+_INFEASIBLE = "Infeasible_Problem_Detected"
 _SILENT: dict[str, Any] = {
     "print_time": False,
     "show_eval_warnings": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
+}
+_WORDS = {
+    _INFEASIBLE: "it found no way to satisfy the constraints",
+    "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
+    "Restoration_Failed": "it could not return to a point that satisfies the constraints",
+    "Invalid_Number_Detected": "a constraint gave an invalid number",
+    "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns",
 }
 
 Constraints = Callable[[Mapping[str, "ca.SX"]], Iterable["ca.SX"]]
@@ -254,18 +261,20 @@ class _Descent:
     def best(self, begin: Optimum) -> _End:
         """Return the best end of runs from the least-squares optimum and other starts.
 
-        The optimum is the only start, unless it is not finite.
+        The optimum is the only start, unless it is not finite or a constraint is active: the
+        minimum on a constraint may be elsewhere.
         """
         ends = []
         if np.isfinite(self.at(begin.theta).cost):
             ends.append(self.descend(begin.theta))
-            if begin.success and not ends[0].failure:
+            constrained = any(self.relations.equal) or any(ends[0].active)
+            if begin.success and not ends[0].failure and not constrained:
                 return ends[0]
         starts = np.clip(starts_of(self.problem, _MOST_STARTS), *self.problem.bounds())
         ends += [self.descend(theta) for theta in starts if np.isfinite(self.at(theta).cost)]
         if not ends:
             raise FitError("no start has a steady response in every row; give another start")
-        if all(end.failure == _INFEASIBLE for end in ends):
+        if all(end.failure == _WORDS[_INFEASIBLE] for end in ends):
             raise FitError(
                 f"no parameters satisfy the constraints {'; '.join(self.relations.texts)} within "
                 "the bounds: relax one of them"
@@ -289,7 +298,7 @@ class _Descent:
             solution = solver(x0=0.0, p=np.hstack(known), lbx=low, ubx=high, lbg=least, ubg=0.0)
             status = str(solver.stats()["return_status"])
             if status not in _SOLVED:
-                failure = status.replace("_", " ").lower()
+                failure = _WORDS.get(status, status.replace("_", " ").lower())
                 break
             step, *pairs = (np.asarray(solution[key]).ravel() for key in ("x", "g", "lam_g"))
             # distance or multiplier is zero, to a tolerance that differs between problems

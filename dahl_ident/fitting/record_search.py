@@ -42,6 +42,7 @@ EXACT = 1e-12  # unexplained share of variance that is rounding
 LOOSE = 1e4  # factor of the step at which a search of a long record has converged
 ROUGH = 15  # steps after which the limits of first states are taken anew
 SETTLED = 0.03  # step in standard errors that is negligible
+_HINDERED = 0.2  # the same where the cost does not fall along a step, as across the kinks of a law
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is significant
 STEPS = 75  # most steps; a search without convergence is not an estimate
 
@@ -140,7 +141,24 @@ class RecordSearch:
             if bool(end.converged[0]) or not np.isfinite(end.cost[0]) or steps == ROUGH:
                 return end
             begin = end.theta
-        return end
+        return self._judged(problem, end)
+
+    def _judged(self, problem: RecordProblem, end: Minima) -> Minima:
+        """Return the end, marked as converged if the next step would be negligible."""
+        noise = unexplained(problem, end)
+        low, high = problem.step_bounds(problem.to_values(end.theta[0]), of_starts=True)
+        # errors of the integration hide small falls of the cost where a motion comes to rest
+        with np.errstate(all="ignore"):
+            at = problem.quadratic(end.theta[0], self.scale, self.rho)
+            if not np.isfinite(at.cost):
+                return end
+            hessian, size = unit_diagonal(at.hessian)
+            blocked = ((end.theta[0] <= low) & (at.gradient > 0.0)) | (
+                (end.theta[0] >= high) & (at.gradient < 0.0)
+            )
+            slope = np.where(blocked, 0.0, at.gradient / size)
+            fall = slope @ np.linalg.pinv(hessian, hermitian=True) @ slope
+        return replace(end, converged=np.array([bool(fall < _HINDERED**2 * noise)]))
 
     def minimise(self, problem: RecordProblem, begin: FloatArray, most: int) -> Minima:
         """Return the minimum near a start, shape (1, P), after at most `most` steps."""

@@ -88,6 +88,12 @@ def _non_negative(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(nnls(rows, (vectors[:, kept].T @ right) / root)[0])
 
 
+def _differ(first: list[float], second: list[float]) -> bool:
+    """Return whether a value differs from the other by a factor of about two."""
+    a, b = np.array(first), np.array(second)
+    return bool(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-300)) > 0.3)
+
+
 class _Scan:
     """The scan of a problem's nonlinear parameters, with the fastest part of each record."""
 
@@ -122,7 +128,7 @@ class _Scan:
         return _History(x[part], v[part], a[part], force[part], output[part], record.time[part])
 
     def starts(self) -> list[list[float]]:
-        """Return the free values at the best starts."""
+        """Return the free values at the best starts that differ."""
         choices = [list(product(*self.grids(e))) for e in self.elements]
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
@@ -140,7 +146,11 @@ class _Scan:
         if not solutions:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
             solutions = [(0.0, values)]
-        return [values for _, values in sorted(solutions, key=itemgetter(0))[:_STARTS]]
+        chosen = list[list[float]]()
+        for _, values in sorted(solutions, key=itemgetter(0)):
+            if len(chosen) < _STARTS and all(_differ(values, other) for other in chosen):
+                chosen.append(values)
+        return chosen
 
     def grids(self, element: Element) -> list[list[float]]:
         """Return values of an element's parameters at which its force is to be computed.
