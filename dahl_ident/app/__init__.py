@@ -4,7 +4,3 @@ A server that only this machine can reach makes the pages from plain files in a 
 Every task that takes time is a command of ``dahl-ident`` in a child process (`work`, `commands`).
 The pages show these commands, so that everything can be repeated without them.
 """
-
-from dahl_ident.app.server import serve
-
-__all__ = ["serve"]

@@ -201,7 +201,7 @@ def app(
     Example: dahl-ident app measurements
     """
     try:
-        from dahl_ident.app import serve
+        from dahl_ident.app.server import serve
     except ModuleNotFoundError as exc:
         raise ValidationError(
             f"the page needs {exc.name}, which is not installed; "
