@@ -132,6 +132,7 @@ def test_a_function_has_no_description():
             "has the kind 'dhal'; expected a law .*, or one of .*dahl.*, mass, damper, spring",
         ),
         ({"kind": "mass", "m": 1.0}, "the mass element has the keys m; expected mass"),
+        ({"kind": "mass", "mass": {"strat": 1.0}}, "mass has the key 'strat'; .* mean 'start'"),
         ({"kind": "linear_system", "quantity": "receptance"}, "the linear_system element has no A"),
     ],
 )

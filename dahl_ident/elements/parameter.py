@@ -12,7 +12,9 @@ from typing import Any, Literal
 import numpy as np
 
 from dahl_ident.arrays import LARGEST, SMALLEST, finite_number, positive_number
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ModelError, ValidationError, choices
+
+_DESCRIPTION = ("free", "start", "lower", "upper", "assumed")  # keys of a described parameter
 
 Dimension = tuple[int, int, int]
 """Powers of force, displacement and time in a unit."""
@@ -171,6 +173,11 @@ class Parameter:
             return replace(self, value=None, free=True, assumed=False)
         if not isinstance(description, Mapping):
             return self.fixed(description)
+        for key in sorted(description.keys() - _DESCRIPTION)[:1]:
+            raise ModelError(
+                f"{self.name} has the key {key!r}; expected a number, 'free', or a table with "
+                f"{choices(_DESCRIPTION, key)}"
+            )
         if "assumed" in description:
             return replace(self, value=description["assumed"], free=False, assumed=True)
         return replace(
