@@ -29,6 +29,7 @@ from dahl_ident.arrays import (
     array_between,
     broadcast_shape,
     finite_array,
+    finite_number,
     non_negative_array,
     positive_array,
     positive_number,
@@ -405,6 +406,10 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
     loop, python-control solves H(j omega) N(A) = -1: H is displacement over a force in the
     direction of the drive, and friction acts in the opposite direction.
 
+    Called with successive displacements, it returns the law's force and stores the history of the
+    motion, like python-control's nonlinearities with memory. Use ``describing_function``, which is
+    exact, rather than python-control's numerical one, whose warm-up is only a single cycle.
+
     Examples
     --------
     >>> import control
@@ -414,12 +419,15 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
     >>> friction = FrictionNonlinearity(Dahl(f_max=1.0, sigma=1.0))
     >>> control.describing_function(friction, [0.0, 1.0]).round(4)
     array([1.    +0.j    , 0.7325+0.3035j])
+    >>> print(f"{friction(1.0):.4f} {friction(0.5):.4f}")
+    0.6321 -0.0101
     """
 
     def __init__(self, friction: Element) -> None:
         super().__init__()
         self._model = friction_alone(friction)
         self._values = self._model.known_values()
+        self._turns = [0.0]
 
     @property
     def friction(self) -> Element:
@@ -437,6 +445,29 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         """
         amplitude = non_negative_array(A, "A")
         return complex(self._model.stiffness(self._values, amplitude, _QUASI_STATIC))
+
+    def __call__(self, A: float) -> float:
+        """Return the force, N, after a monotonic move to the displacement `A`, m."""
+        x = finite_number(np.squeeze(A), "displacement")
+        if len(self._turns) > 1 and (x - self._turns[-1]) * (self._turns[-1] - self._turns[-2]) > 0:
+            self._turns[-1] = x  # the force depends only on the turning points
+        else:
+            self._turns.append(x)
+        return float(self._model.force(self._turns)[-1])
+
+    def reset(self) -> None:
+        """Reset the history: displacement and force are zero.
+
+        Examples
+        --------
+        >>> from dahl_ident import Dahl
+        >>> friction = FrictionNonlinearity(Dahl(f_max=1.0, sigma=1.0))
+        >>> first = friction(1.0)
+        >>> friction.reset()
+        >>> friction(1.0) == first
+        True
+        """
+        self._turns = [0.0]
 
     def _isstatic(self) -> bool:
         return False
