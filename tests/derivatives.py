@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident import Friction
-
 
 def central_differences(function: Callable[[Any], Any], point: ArrayLike, steps: ArrayLike) -> Any:
     """Return the derivatives of a function of n numbers, (n, ...)."""
@@ -19,13 +17,3 @@ def central_differences(function: Callable[[Any], Any], point: ArrayLike, steps:
         change = np.asarray(function(point + step)) - np.asarray(function(point - step))
         slopes.append(change / (2.0 * step.sum()))
     return np.array(slopes)
-
-
-def stiffness_slopes(law: Friction, amplitude: ArrayLike) -> dict[str, Any]:
-    """Return dN/dp for each parameter of a law, and dN/dA as "amplitude"."""
-    free = law.copy_with(tuple(p.freed() for p in law.parameters))
-    A = np.asarray(amplitude, dtype=np.float64)
-    slopes = free.stiffness_gradient(law.known_values(), A, np.zeros(()))
-    return dict(
-        zip((*law.labels, "amplitude"), (*slopes.by_parameter, slopes.by_amplitude), strict=True)
-    )

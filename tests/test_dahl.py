@@ -9,7 +9,6 @@ from scipy.integrate import trapezoid
 
 from dahl_ident import Dahl, Model
 from dahl_ident.errors import ModelError, ValidationError
-from tests.derivatives import stiffness_slopes
 
 ALPHAS = (0.25, 0.5, 1.0, 2.0, 4.0)
 DECADES = np.geomspace(1e-12, 1e12, 49)
@@ -71,7 +70,7 @@ def test_even_harmonics_are_exactly_zero(alpha, k):
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_gradient_at_rest_is_the_limit(alpha):
     friction = Dahl(0.5, 30.0, alpha)
-    at_rest, near = stiffness_slopes(friction, 0.0), stiffness_slopes(friction, 1e-9)
+    at_rest, near = friction.gradient(0.0), friction.gradient(1e-9)
     assert at_rest["sigma"] == 1.0
     assert at_rest["f_max"] == 0.0
     assert at_rest["alpha"] == 0.0
@@ -92,7 +91,7 @@ def test_extreme_units_give_the_same_curve(alpha, f_max, sigma):
     np.testing.assert_allclose(
         friction.describing_function(A) / sigma, unit.describing_function(beta), rtol=1e-12
     )
-    ours, truth = stiffness_slopes(friction, A), stiffness_slopes(unit, beta)
+    ours, truth = friction.gradient(A), unit.gradient(beta)
     np.testing.assert_allclose(ours["sigma"], truth["sigma"], rtol=1e-9)
     np.testing.assert_allclose(ours["f_max"] * x_c, truth["f_max"], rtol=1e-9)
     a, b = friction.fourier_coefficients(A, harmonic=3)
@@ -114,6 +113,7 @@ CALLS: dict[str, Callable[[Dahl, Any], Any]] = {
     "equivalent_damping": lambda d, A: d.equivalent_damping(A, 2.0),
     "dissipated_energy": lambda d, A: d.dissipated_energy(A),
     "fourier_coefficients": lambda d, A: d.fourier_coefficients(A, harmonic=3)[0],
+    "gradient": lambda d, A: d.gradient(A)["sigma"],
     "dynamic_stiffness": lambda d, A: d.dynamic_stiffness(A),
 }
 every_call = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS.keys())
@@ -153,7 +153,7 @@ def test_every_call_is_finite_to_the_edges_of_what_is_accepted(f_max, sigma, alp
     N = friction.describing_function(A)
     assert np.all((N.real >= 0.0) & (N.imag >= 0.0) & (np.abs(N) <= sigma * (1.0 + 1e-15)))
     assert N[0] == sigma
-    for values in stiffness_slopes(friction, A).values():
+    for values in friction.gradient(A).values():
         assert np.isfinite(values).all()
     for k in (1, 3, 15):
         a, b = friction.fourier_coefficients(A, k)

@@ -6,8 +6,11 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from dahl_ident.elements.general_dahl import stiffness
-from dahl_ident.elements.linear_dahl import describing_function, describing_function_gradient
+from dahl_ident.elements.linear_dahl import (
+    describing_function,
+    describing_function_gradient,
+    harmonic_gradient,
+)
 
 SWITCHES = (0.2, 8.0, 75.0, 300.0)  # of the kernel, and of scipy's Bessel functions (8)
 ODD = (1, 3, 5, 7, 9, 11, 13, 15)
@@ -59,12 +62,6 @@ def exact_harmonic(beta, k):
         return complex(real, imag), complex(real_slope, imag_slope)
 
 
-def harmonic_gradient(beta, k):
-    """Return c_k and beta dc_k/dbeta, by the quadrature for any exponent."""
-    h, _, by_ln_sigma, _ = stiffness(beta, np.ones(()), k, 2)
-    return beta * h, beta * by_ln_sigma
-
-
 def modulus_error(value, reference):
     return float(np.max(np.abs(value - reference) / np.abs(reference)))
 
@@ -110,8 +107,8 @@ def test_high_harmonics(k, tolerance):
     assert modulus_error(by_ln_beta, reference[1]) < tolerance
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (3, 4), (2, 0, 3)])
-def test_shapes(shape):
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (3, 4), (2, 0, 3), (8191,), (8193,), (3, 5500)])
+def test_shapes_and_blocks(shape):
     beta = 10.0 ** np.random.default_rng(3).uniform(-3.0, 4.0, shape)
     values = (*describing_function_gradient(beta), *harmonic_gradient(beta, 3))
     assert {value.shape for value in values} == {shape}

@@ -1,22 +1,25 @@
 """The Dahl friction element: describing function, harmonics, loop and force, exactly.
 
 Under x = A cos(omega t) the force settles into a loop that depends on beta = sigma A / f_max
-alone, up to scale, and not on the frequency. Its fundamental has a closed form for alpha = 1, see
-:mod:`dahl_ident.elements.linear_dahl`; any other exponent, and the harmonics, take one quadrature,
-see :mod:`dahl_ident.elements.general_dahl`.
+alone, up to scale, and not on the frequency. Its Fourier coefficients have closed forms for
+alpha = 1, see :mod:`dahl_ident.elements.linear_dahl`; any other exponent takes one quadrature, see
+:mod:`dahl_ident.elements.general_dahl`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import (
     ComplexArray,
     FloatArray,
     array_between,
+    non_negative_array,
 )
 from dahl_ident.elements import general_dahl, hysteresis, linear_dahl
 from dahl_ident.elements.backlash import Backlash
@@ -31,12 +34,14 @@ from dahl_ident.elements.facts import (
     StiffnessGradient,
     UniversalCurve,
     Values,
+    each_harmonic,
 )
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.iwan import Iwan
 from dahl_ident.elements.lugre import LuGre
 from dahl_ident.elements.maxwell_slip import MaxwellSlip
 from dahl_ident.elements.parameter import Assumed, Parameter
+from dahl_ident.errors import ValidationError
 
 _EXPONENTS = (1e-9, 1e3)  # beyond them the loop equals that of the limit
 _ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
@@ -157,6 +162,49 @@ class Dahl(Friction):
         f_max, sigma, *_ = self.known_values()
         return float(f_max / sigma)
 
+    def gradient(
+        self, amplitude: ArrayLike, names: Iterable[str] | None = None
+    ) -> dict[str, ComplexArray]:
+        """Return dN/dp for each parameter p of the element, and dN/dA as ``"amplitude"``.
+
+        Parameters
+        ----------
+        amplitude : array_like
+            Zero-to-peak displacement A >= 0, m.
+        names : iterable of str, optional
+            The derivatives to return; by default all of them. Without alpha, which takes a
+            quadrature, an element with alpha = 1 uses closed forms, which are some twenty
+            times faster.
+
+        Returns
+        -------
+        dict of str to ndarray of complex
+            Derivatives in N/m per unit of the parameter, by the parameter's name.
+
+        Raises
+        ------
+        ModelError
+            If a parameter has no value.
+        ValidationError
+            If an amplitude is negative, NaN, infinite or complex, or a name is unknown.
+
+        Examples
+        --------
+        >>> sorted(Dahl(f_max=1.0, sigma=2.0).gradient(1.0))
+        ['alpha', 'amplitude', 'f_max', 'sigma']
+        """
+        A = non_negative_array(amplitude, "amplitude")
+        known = [*(p.name for p in self.parameters), "amplitude"]
+        chosen = known if names is None else list(names)
+        unknown = [name for name in chosen if name not in known]
+        if unknown:
+            raise ValidationError(f"names has {unknown[0]!r}; expected some of {', '.join(known)}")
+        values = self.known_values()
+        parameters = [replace(p, free=p.name in chosen) for p in self.parameters]
+        result = self.copy_with(tuple(parameters)).settled(values, Sine(A, np.zeros(())), 2)
+        every = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
+        return {name: every[name][()] for name in chosen}
+
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 at `values`, unchecked; by the engine where there are two limits.
 
@@ -165,15 +213,30 @@ class Dahl(Friction):
         """
         if self.has_optional:
             return super().settled(values, sine, derivatives)
+        if bool(np.equal(values[2], 1.0).all()):
+            return self._settled_linear(values, sine, derivatives)
         beta = _beta(values, sine)
-        fundamental = isinstance(sine.harmonic, int) and sine.harmonic == 1
-        slope_of_alpha = derivatives > 1 and self.parameters[2].free
-        if fundamental and not slope_of_alpha and bool(np.equal(values[2], 1.0).all()):
-            zero = np.zeros(beta.shape, dtype=np.complex128)
-            closed = (*linear_dahl.describing_function_gradient(beta), zero)
-            return _scaled(values, beta, closed[: general_dahl.COUNTS[derivatives]])
         parts = general_dahl.stiffness(beta, values[2], sine.harmonic, derivatives)
         return _scaled(values, beta, parts)
+
+    @each_harmonic
+    def _settled_linear(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        beta, k = _beta(values, sine), int(sine.harmonic)
+        parts: tuple[ComplexArray, ...]
+        if k != 1:
+            c, rise = linear_dahl.harmonic_gradient(beta, k)
+            parts = (c / beta, (c - rise) / beta, rise / beta)
+        elif derivatives:
+            parts = linear_dahl.describing_function_gradient(beta)
+        else:
+            parts = (linear_dahl.describing_function(beta),)
+        if derivatives > 1:
+            if self.parameters[2].free:
+                by_alpha = general_dahl.stiffness(beta, values[2], k, derivatives)[3]
+            else:
+                by_alpha = np.zeros(beta.shape, dtype=np.complex128)
+            parts = (*parts, by_alpha)
+        return _scaled(values, beta, parts[: general_dahl.COUNTS[derivatives]])
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
