@@ -8,11 +8,12 @@ import pytest
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_dataset
 from dahl_ident.diagnostics import VerdictStatus
-from dahl_ident.diagnostics.misfit_explanations import neighbourhood
+from dahl_ident.diagnostics.misfit_explanations import SIGN_CHANGES, neighbourhood
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, X_C, plant_table, relative_noise, stated, table
 
 MODEL = Dahl(alpha=1.0) + Mass(0.3) + Damper() + Spring()
+CONJUGATED, NEGATED, BOTH = SIGN_CHANGES
 BY: Final = "describing function"  # which predicts in a moment, and makes the plant's table
 
 
@@ -27,8 +28,8 @@ def noisy():
 
 
 def test_a_sign_is_named_where_there_is_no_finite_optimum():
-    data = replace(noisy(), response=noisy().response.conj())
-    with pytest.raises(FitError, match=r"^The mechanism gives energy .* No finite optimum"):
+    data = CONJUGATED(noisy())
+    with pytest.raises(FitError, match=r"^With the response conjugated .* No finite optimum"):
         fit(data, Dahl())
 
 
@@ -97,22 +98,45 @@ class TestRows:
 
 
 class TestSign:
-    @pytest.mark.parametrize("turn", [np.conj, np.negative])
     @pytest.mark.parametrize(
-        ("data", "model"), [(noisy(), Dahl()), (plant_table(steady=BY), MODEL)]
+        ("turn", "data", "model"),
+        [
+            *((turn, noisy(), Dahl()) for turn in SIGN_CHANGES),
+            (CONJUGATED, plant_table(steady=BY), MODEL),
+        ],
     )
-    def test_is_named(self, turn, data, model):
+    def test_is_named_with_its_misfit(self, turn, data, model):
         right = fit(data, model, steady=BY).goodness
-        turned = replace(data, response=turn(data.response))
-        wrong = fit(turned, model, throw=False, steady=BY)
-        assert "gives energy to its drive" in wrong.statements[0]
-        assert "check the sign of the phase" in wrong.statements[0]
+        wrong = fit(turn(data), model, throw=False, steady=BY)
+        assert f"With the response {turn.name} the misfit falls from " in wrong.statements[0]
+        assert f"to {100.0 * right.rms_misfit:.2g} % rms: check " in wrong.statements[0]
         assert "Do not use the numbers of this fit" in wrong.statements[0]
         report = wrong.fit_report()
         assert report.count(wrong.goodness.sign) == 1
         assert "Other models" not in report  # each would be fitted to the wrong sign
         assert not wrong.trusted
         assert right.sign == ""
+
+    def test_the_data_s_covariances_turn_with_it(self):
+        """Turned by hand, from draws of amplitude, real and imaginary part."""
+        draws = np.random.default_rng(1).multivariate_normal(
+            np.zeros(3), [[1.0, 0.3, 0.2], [0.3, 2.0, 0.5], [0.2, 0.5, 1.0]], 50
+        )
+        for turn, signs in ((CONJUGATED, (1, -1)), (NEGATED, (-1, -1)), (BOTH, (-1, 1))):
+            before = np.cov(draws.T)
+            after = np.cov((draws * [1, *signs]).T)
+            data = FrequencyResponse(
+                [1.0],
+                [100.0 + 50.0j],
+                [10.0],
+                covariance=before[None, 1:, 1:],
+                amplitude_std=[np.sqrt(before[0, 0])],
+                amplitude_covariance=before[None, 0, 1:],
+            )
+            turned = turn(data)
+            assert turned.response[0] == complex(100.0 * signs[0], 50.0 * signs[1])
+            np.testing.assert_allclose(turned.covariance[0], after[1:, 1:], rtol=1e-12)
+            np.testing.assert_allclose(turned.amplitude_covariance[0], after[0, 1:], rtol=1e-12)
 
     def test_is_not_blamed_for_another_departure(self):
         stiff = table(model=FRICTION + Spring(20.0))

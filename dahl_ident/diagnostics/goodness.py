@@ -273,7 +273,7 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
         tested = replace(tested, neighbours=_side_by_side(optimum, tested))
     if optimum.method == "ipopt" or (optimum.success and not tested.objections):
         return tested  # Ipopt may have had constraints, which other searches would not keep
-    sign = sign_convention(optimum.problem)
+    sign = sign_convention(optimum, tested.rms_misfit, _misfit_if_described)
     if sign:
         return replace(tested, sign=sign)
     tested = _without_suspicious(optimum, tested)
@@ -288,6 +288,11 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
 def _tested_estimate(optimum: Optimum) -> Goodness:
     """Return the tests of the estimate that belongs to an optimum."""
     return _tested(optimum, error_model(optimum, of_combinations=True))
+
+
+def _misfit_if_described(optimum: Optimum) -> float:
+    tested = _tested_estimate(optimum)
+    return np.inf if tested.objections else tested.rms_misfit
 
 
 def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:

@@ -8,8 +8,8 @@ a time. The level is 1 % for the whole table, divided by the number of rows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
@@ -22,8 +22,10 @@ from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum, Status, solve
+from dahl_ident.fitting.global_start import global_starts
 from dahl_ident.problem import RecordProblem, TableProblem
 from dahl_ident.problem.record_noise import in_band
+from dahl_ident.units import percent
 
 _CHANCE = 0.01  # false-alarm rate of the worst of all points
 _SHARE = 0.1  # of the rows: if more deviate, the model or noise is wrong, not single rows
@@ -31,8 +33,7 @@ _ONE_BY_ONE = 500  # rows up to which each is removed before the next is judged
 _LEAST_DOF = 4  # without the suspicious rows; fewer do not show the noise
 _GOOD = "good"
 EXPLAINS = 3.0  # factor by which a cause lowers the misfit
-_GIVES_ENERGY = -0.05  # mean sine of the stiffness's phase: a loss of energy makes it positive
-_GIVING = "The mechanism gives energy to its drive, as no friction does"
+_PROMISING = 1.5  # the same at the start of a search
 _CLUSTER_BY_CHANCE = 0.01  # probability that rows at random lie as close together
 _FEWEST = 5  # fewest values of which the first and the last are ends
 
@@ -142,29 +143,98 @@ def flagged_rows(data: FrequencyResponse) -> tuple[str, ...]:
     )
 
 
+@dataclass(frozen=True)
+class SignChange:
+    """A change of sign of the response's real or imaginary part, and its likely cause."""
+
+    name: str
+    real: int
+    imaginary: int
+    check: str
+
+    def __call__(self, data: FrequencyResponse) -> FrequencyResponse:
+        """Return the data with these signs, their covariances included."""
+        signs = np.array([self.real, self.imaginary])
+        covariance = data.covariance
+        cross, of_drive = data.amplitude_covariance, data.drive_covariance
+        return replace(
+            data,
+            response=self.real * data.response.real + 1j * self.imaginary * data.response.imag,
+            covariance=None if covariance is None else covariance * np.outer(signs, signs),
+            amplitude_covariance=None if cross is None else cross * signs,
+            drive_covariance=None if of_drive is None else of_drive * signs,
+        )
+
+
+_PHASE = (
+    "check the sign of the phase, which is that of exp(+j omega t): the force leads the "
+    "displacement where friction dissipates"
+)
+_SIGN = "check that force and displacement are positive in the same direction"
+SIGN_CHANGES = (
+    SignChange("conjugated", 1, -1, _PHASE),
+    SignChange("negated", -1, -1, _SIGN),
+    SignChange("negated and conjugated", -1, 1, f"{_PHASE}, and {_SIGN}"),
+)
+
+
 def rms_misfit_of(problem: TableProblem, fitted: ComplexArray) -> float:
     """Return the root mean square of abs(measured - fitted)/abs(measured) of fundamentals."""
     return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
 
-def sign_convention(problem: TableProblem) -> str:
-    """Return a sentence if the measured response gives energy to its source, otherwise ""."""
-    view = problem.stiffness_data
-    Z = view.stiffness[(view.harmonic == 1) & (view.stiffness != 0.0)]
-    phase = float(np.mean(Z.imag / np.abs(Z))) if Z.size else 0.0
-    if phase > _GIVES_ENERGY:
+def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimum], float]) -> str:
+    """Return in words which sign convention explains the misfit; "" if none does.
+
+    `before` is the misfit of the estimate, and `misfit_of` returns that of another optimum, which
+    is infinite if tests object to it: a change of sign may also reduce the misfit due to a missing
+    mass or spring, but not down to the noise.
+    """
+    fitted = optimum.problem.predict(optimum.theta)
+    middle = float(np.median(_misfit(optimum.problem, fitted)))
+    promising = []
+    for change in SIGN_CHANGES:
+        try:
+            problem = optimum.problem.like(data=change(optimum.problem.data))
+            # exact motions of a start far off take long
+            sine = problem.with_steady("describing function")
+            started = sine.predict(global_starts(sine).theta[0])
+            # the median, as the start may be wrong for single rows near a resonance
+            first = float(np.median(_misfit(problem, started)))
+        except DahlIdentError:
+            continue
+        if first * _PROMISING < middle:
+            promising.append((first, change, problem))
+    if not promising:
         return ""
-    return (
-        f"{_GIVING}: check the sign of the phase, which is that of exp(+j omega t), and that force "
-        "and displacement are positive in the same direction"
-    )
+    _, change, problem = min(promising, key=lambda candidate: candidate[0])
+    after = misfit_of(solve(problem, loss=optimum.loss))
+    return _with_changed_sign(f"the response {change.name}", before, after, change.check)
 
 
-def force_convention(problem: RecordProblem) -> str:
-    """Return a sentence if the force takes energy out of the mechanism, otherwise ""."""
+def _with_changed_sign(what: str, before: float, after: float, check: str) -> str:
+    misfits = f"from {percent(before)} to {percent(after)} rms"
+    explains = after * EXPLAINS < before
+    return f"With {what} the misfit falls {misfits}: {check}" if explains else ""
+
+
+def force_convention(optimum: Optimum, before: float) -> str:
+    """Return a sentence if the wrong sign of the records' force explains the misfit, or "".
+
+    The opposite sign is only fitted if the force takes energy out of the mechanism.
+    """
+    problem: RecordProblem = optimum.problem
     if problem.excitation == "base" or _work(problem) >= 0.0:
         return ""
-    return f"{_GIVING}: check that force and displacement are positive in the same direction"
+    force = [(r, "drive" if r.force is None else "force") for r in problem.records]
+    records = [replace(r, **{name: -getattr(r, name)}) for r, name in force]
+    try:
+        changed = solve(problem.like(records=records), loss=optimum.loss)
+    except DahlIdentError:
+        return ""
+    residuals = np.concatenate(changed.problem.split_residuals(changed.values))
+    after = float(np.sqrt(np.mean(residuals**2))) / problem.output_std
+    return _with_changed_sign("the force negated", before, after, _SIGN)
 
 
 def _work(problem: RecordProblem) -> float:

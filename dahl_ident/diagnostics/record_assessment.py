@@ -329,7 +329,7 @@ class RecordAssessment(Assessment):
         goodness = record_goodness(self.problem, self.residuals)
         if goodness.rms_in_band < _LARGE:
             return goodness
-        return replace(goodness, sign=force_convention(self.problem))
+        return replace(goodness, sign=force_convention(self.optimum, goodness.rms_misfit))
 
     @property
     def exceeds_noise(self) -> bool:
