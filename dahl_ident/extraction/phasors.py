@@ -32,6 +32,7 @@ from dahl_ident.extraction.segment_quality import (
     alias_error,
     asymmetry,
     clipped_share,
+    crest_samples,
     distortion,
     fundamental_share,
     has_unmeasured_aliases,
@@ -349,7 +350,9 @@ class Phasors:
         fit, steps = self.fit, self.steps
         shares = fundamental_share(fit, fit.segment)
         amplitudes = np.abs(fit.phasors(1))
-        clipped = list(map(clipped_share, self.recorded, steps))
+        crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase)
+        longest = (crest, np.inf)
+        clipped = list(map(clipped_share, self.recorded, steps, longest))
         with np.errstate(divide="ignore"):
             in_steps = amplitudes / steps
         return {

@@ -28,6 +28,9 @@ _LONG_GAP = 30.5  # steps; a longer gap between values is not tested for whole s
 _ON_GRID = 0.1  # largest deviation of the other gaps from whole steps
 _MOSTLY = 0.9  # least fraction of such gaps; with less, the step is too fine to matter
 _SAME_VALUE = 1e-9  # fraction of the range; values closer together differ only by rounding
+_RAIL_RUN = 5  # samples in a row at an extreme value that may be clipped
+_CORNER = 3  # samples within which a clipped waveform leaves the rail
+_DEPARTURE = 1e-4  # fraction of the span by which it is then away from the rail
 _SEEN, _VISIBLE = 0.75, 1e-6  # steps, and fraction of the span: noise that constant values lack
 _BEYOND_CHANCE = 3.0  # standard deviations by which a count of samples exceeds another
 _ORDERS = 3, 6  # of differences, whose sizes agree for white noise, but not for a motion
@@ -92,22 +95,37 @@ def white_noise(samples: FloatArray) -> float:
     return min(sizes) if max(sizes) < _AGREE * min(sizes) else 0.0
 
 
-def clipped_share(samples: FloatArray, step: float) -> float:
-    """Return the fraction of samples that are clipped, where noise is seen.
+def clipped_share(samples: FloatArray, step: float, crest: float = np.inf) -> float:
+    """Return the fraction of samples that are clipped.
 
-    Extreme values of noise are rare: more samples at the extreme value than one step below are
-    clipped. Without noise, a force in slip is as constant as a clipped one.
+    Where noise is seen, its extreme values are rare: more samples at the extreme value than one
+    step below are clipped. Where it is not, runs of constant extreme values that end in a corner
+    are. A force in slip is as constant then, so only runs longer than the `crest` of a sine count.
     """
     highest, lowest = float(samples.max()), float(samples.min())
     span = highest - lowest
-    if white_noise(samples) <= max(_SEEN * step, _VISIBLE * span):
-        return 0.0
     tolerance = max(0.5 * step, _SAME_VALUE * span)
+    noise_is_seen = white_noise(samples) > max(_SEEN * step, _VISIBLE * span)
     stuck = 0
     for depth in (highest - samples, samples - lowest):
-        at, below = (int(np.sum(depth < limit)) for limit in (tolerance, step + tolerance))
-        stuck += at if 2 * at - below > _BEYOND_CHANCE * np.sqrt(below) else 0
+        at_rail = depth < tolerance
+        if noise_is_seen:
+            at, below = int(at_rail.sum()), int(((depth < step + tolerance) & ~at_rail).sum())
+            stuck += at if at - below > _BEYOND_CHANCE * np.sqrt(at + below) else 0
+            continue
+        edges = np.flatnonzero(np.diff(at_rail, prepend=False, append=False))
+        starts, stops = edges[::2], edges[1::2]
+        before = depth[np.maximum(starts - _CORNER, 0)]
+        after = depth[np.minimum(stops + _CORNER - 1, samples.size - 1)]
+        runs = (stops - starts)[np.minimum(before, after) > _DEPARTURE * span]
+        stuck += int(runs[runs > max(_RAIL_RUN, 1.5 * crest)].sum())
     return stuck / samples.size
+
+
+def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
+    """Return how many samples of a sine lie within one sensor step of its crest."""
+    below = min(max(step / amplitude, _SAME_VALUE), 2.0)
+    return float(2.0 * np.arccos(1.0 - below) / sample_phase) + 1.0
 
 
 def fundamental_share(fit: SineFit, segment: Segment) -> FloatArray:

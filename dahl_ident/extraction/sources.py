@@ -122,7 +122,7 @@ def extract(
         ``displacement_steps``, ``force_steps``
             Amplitude in steps of the sensor; infinite if no steps are visible.
         ``displacement_clipped``, ``force_clipped``
-            Share of samples that are constant at the highest or lowest value, where noise is seen.
+            Share of samples that are constant at the highest or lowest value.
         ``verdict``
             "good", or the reasons against the point, such as a negative loss.
 
