@@ -7,7 +7,7 @@ import pytest
 
 from dahl_ident.data import Record
 from dahl_ident.elements import Dahl
-from dahl_ident.errors import ExtractionError
+from dahl_ident.errors import ExtractionError, arguments_as_options
 from dahl_ident.extraction import extract
 
 FRICTION = Dahl(f_max=20.0, sigma=2e4)
@@ -51,10 +51,32 @@ def test_any_other_motion_is_refused_and_the_route_named(kind, seed):
         "strokes": lambda: strokes(seed),
         "there and back": lambda: np.cumsum(np.clip(np.linspace(3, -3 - seed, 4000), -1, 1)) / RATE,
     }[kind]()
-    with pytest.raises(ExtractionError, match=r"^not a sine test: ") as refused:
+    with pytest.raises(ExtractionError, match=r"^not a sine test(: |, or a)") as refused:
         extract(record(x))
     assert str(refused.value).endswith("fit the waveform itself: di.fit(record, model)")
     assert "min_share" not in str(refused.value)
+
+
+def test_a_swept_force_that_friction_cannot_follow_is_named_with_the_command():
+    t = np.arange(4000) / 100.0
+    force = 0.3 * np.sin(2.0 * np.pi * 4.0 * (np.exp(0.075 * t) - 1.0))  # 0.3 to 6 Hz
+    x, v, friction = np.zeros(t.size), 0.0, 0.0
+    for i in range(1, t.size):  # the plant of Fig. 7, in ten small steps a sample
+        x[i] = x[i - 1]
+        for push in np.linspace(force[i - 1], force[i], 10):
+            v += 1e-3 * (push - friction - 0.24 * v - 0.3 * x[i]) / 0.3
+            x[i] += 1e-3 * v
+            friction += 1e-3 * v * 30.0 * (1.0 - np.sign(v) * friction / 0.1)
+    swept = Record(t, displacement=x, force=force)
+    with pytest.raises(ExtractionError, match=r"^not a sine test: ") as refused:
+        extract(swept, controlled="force")
+    assert "the force is a sweep of one sine" in str(refused.value)
+    assert "di.fit(record, model)" in str(refused.value)
+    with (
+        arguments_as_options(),
+        pytest.raises(ExtractionError, match="dahl-ident fit --record FILE"),
+    ):
+        extract(swept, controlled="force")
 
 
 def test_levels_far_apart_sweeps_and_a_sine_in_noise_are_sine_tests():

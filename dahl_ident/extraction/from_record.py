@@ -8,6 +8,7 @@ energy, is like the one before it; in random motion only a few are, by chance.
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -43,6 +44,8 @@ _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 _WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are not due to chance
 _PERIOD_CHANGE = 0.03  # largest change of log period between cycles of a sine (median by energy)
 _AMPLITUDE_CHANGE = 0.1  # the same of log amplitude, which changes faster at a resonance
+_SWEEP_RANGE = 0.2  # least change of log period over a sweep; less may be due to chance
+_SWEEP_CYCLES = 6  # least number in a sweep: they give four second differences of the period
 _FEWEST_PAIRS = 2  # neighbouring cycles needed to judge how similar cycles are
 _NOISY = 0.03  # noise of the log amplitude from which cycles cannot be compared
 # Least fraction of the power near the strongest line of a sine whose cycles differ:
@@ -247,7 +250,7 @@ def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]
         except ExtractionError as exc:
             refused.append(str(exc))
     if frequency is None:
-        _refuse_other_motion(motion, runs, points)
+        _refuse_other_motion(record, motion, runs, points)
     if not points:
         raise ExtractionError(_summary(refused))
     for point in points:
@@ -257,29 +260,67 @@ def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]
 
 
 def _refuse_other_motion(
-    motion: FloatArray, runs: Sequence[Cycles], points: Sequence[Point]
+    record: Record, motion: FloatArray, runs: Sequence[Cycles], points: Sequence[Point]
 ) -> None:
     """Refuse a record that is not a sine measurement, even if chance gives some points."""
     moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
     measured = sum(p.quality["end_time"] - p.quality["start_time"] for p in points)
     if measured > _WELL_COVERED * moving:
         return
-    noise, period, amplitude = _neighbour_changes(runs)
-    share, periods = _strongest_line(motion)
-    least = _SINE_IN_NOISE if measured > 0.0 or _NOISY < noise < np.inf else _ONE_LINE
+    reason = _not_a_sine_test(motion, runs, covered=measured / moving if moving else 0.0)
+    if reason and not _is_sweep(find_cycles(record.time, record.force_samples)):
+        raise ExtractionError(
+            f"{reason}; expected levels or a sweep of one sine; for any other motion fit the "
+            f"waveform itself: {spelled('di.fit(record, model)', 'dahl-ident fit --record')}"
+        )
+    if reason:
+        file = shlex.quote(str((record.provenance or {}).get("file", "FILE")))
+        free = f"dahl-ident fit --record {file} --mass free --damping free --stiffness free"
+        raise ExtractionError(
+            f"{reason}; the force is a sweep of one sine, which the motion is too unsteady to "
+            f"follow in a table; fit the waveforms: {spelled('di.fit(record, model)', free)}"
+        )
+
+
+def _not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:
+    """Return why the motion is not a sine measurement; empty if it may be one.
+
+    `covered` is the fraction of the moving time that points cover.
+    """
+    noise, period, amplitude, pairs = _neighbour_changes(runs)
     similar = period <= _PERIOD_CHANGE and amplitude <= _AMPLITUDE_CHANGE
-    if similar or (share > least and periods > 1):
-        return
-    waveform = spelled("di.fit(record, model)", "dahl-ident fit --record")
-    raise ExtractionError(
-        "not a sine test: cycles of the motion are not alike, and its strongest line has "
-        f"{percent(share)} of the power; expected levels or a sweep of one sine; for any other "
-        f"motion fit the waveform itself: {waveform}"
+    if pairs >= _FEWEST_PAIRS and similar:
+        return ""
+    line, periods = _strongest_line(motion)
+    in_noise = pairs >= _FEWEST_PAIRS and (covered > 0.0 or noise > _NOISY)
+    if line > (_SINE_IN_NOISE if in_noise else _ONE_LINE) and periods > 1:
+        return ""
+    power = f"its strongest line has {percent(line)} of the power"
+    if pairs < _FEWEST_PAIRS:
+        short = ", or a record too short for one" if periods < _FEWEST_PAIRS else ""
+        return f"not a sine test{short}: the motion has no two consecutive cycles, and {power}"
+    return (
+        f"not a sine test: neighbouring cycles of the motion differ by {percent(period)} in "
+        f"period and {percent(amplitude)} in amplitude (median), and {power}"
     )
 
 
-def _neighbour_changes(runs: Sequence[Cycles]) -> tuple[float, float, float]:
-    """Return medians over pairs of neighbouring cycles, infinite if there are fewer than two.
+def _is_sweep(runs: Sequence[Cycles]) -> bool:
+    """Return whether the drive is one sine whose period changes smoothly from cycle to cycle."""
+    if not runs:
+        return False
+    run = max(runs, key=len)
+    period = np.log(run.stop - run.start)
+    if len(run) < _SWEEP_CYCLES or np.ptp(period) < _SWEEP_RANGE:
+        return False
+    energy = np.exp(2.0 * (run.log_amplitude - run.log_amplitude.max()) + period)[1:-1]
+    period_change = _median(np.abs(np.diff(period, 2)), energy)
+    amplitude_change = _median(np.abs(np.diff(run.log_amplitude))[1:], energy)
+    return period_change <= _PERIOD_CHANGE and amplitude_change <= _AMPLITUDE_CHANGE
+
+
+def _neighbour_changes(runs: Sequence[Cycles]) -> tuple[float, float, float, int]:
+    """Return medians over pairs of neighbouring cycles, and the number of pairs.
 
     The medians, weighted by energy, are those of the noise, of the change of log period, and of the
     change of log amplitude.
@@ -293,12 +334,18 @@ def _neighbour_changes(runs: Sequence[Cycles]) -> tuple[float, float, float]:
             + np.log(run.stop[1:] - run.start[:-1]),
         )
         for run in runs
+        if len(run) > 1
     ]
-    if sum(len(noise) for noise, *_ in pairs) < _FEWEST_PAIRS:
-        return np.inf, np.inf, np.inf
+    if not pairs:
+        return np.inf, np.inf, np.inf, 0
     noise, period, amplitude, log_energy = (np.concatenate(c) for c in zip(*pairs, strict=True))
     energy = np.exp(log_energy - log_energy.max())
-    return _median(noise, energy), _median(period, energy), _median(amplitude, energy)
+    return (
+        _median(noise, energy),
+        _median(period, energy),
+        _median(amplitude, energy),
+        energy.size,
+    )
 
 
 def _median(values: FloatArray, weights: FloatArray) -> float:
