@@ -1,6 +1,12 @@
 """From a record to a frequency response: segments, sine fits, verdicts, one table.
 
-A record may be read in pieces, which may end within a level: each part of it then gives a point.
+A record may be read in pieces, which may end within a level. Each part of the level, with n_i
+cycles, then gives a point, and these are combined with weights w_i = n_i / sum n:
+
+    N = sum w_i N_i,      C = sum w_i^2 (C_i - R_i) + sum w_i R_i
+
+R is the part of C due to rounding and aliasing, which is the same in every cycle. The cycles of a
+part that has not settled count as settling periods of the next part.
 
 A record that is not a sine measurement is refused. In a sine test almost every cycle, weighted by
 energy, is like the one before it; in random motion only a few are, by chance.
@@ -21,6 +27,8 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.errors import ExtractionError, argument, spelled
 from dahl_ident.extraction.cycles import (
+    AMPLITUDE_TOLERANCE,
+    FREQUENCY_TOLERANCE,
     Cycles,
     find_cycles,
 )
@@ -31,6 +39,8 @@ from dahl_ident.extraction.sine_fit import (
     CYCLES_FOR_SCATTER,
     FEWEST_CYCLES,
     HARMONICS,
+    LineNoise,
+    Samples,
     Segment,
     SineFit,
     sine_fit,
@@ -42,6 +52,7 @@ _NEGLIGIBLE_BIAS = 0.2  # bias over standard error down to which settling cycles
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
 _WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are not due to chance
+_MISSING_CYCLES = 3.0  # largest number between two parts of one level
 _PERIOD_CHANGE = 0.03  # largest change of log period between cycles of a sine (median by energy)
 _AMPLITUDE_CHANGE = 0.1  # the same of log amplitude, which changes faster at a resonance
 _SWEEP_RANGE = 0.2  # least change of log period over a sweep; less may be due to chance
@@ -60,7 +71,7 @@ class Point:
     """One amplitude and frequency: responses of the fundamental and the harmonics.
 
     `joint` is the covariance of (controlled amplitude, real part, imaginary part) of each response,
-    (rows, 3, 3).
+    (rows, 3, 3); `repeating` is the part of it that is the same in every cycle.
     """
 
     frequency_hz: float
@@ -69,12 +80,16 @@ class Point:
     harmonic: list[int]
     response: ComplexArray
     joint: FloatArray
+    repeating: FloatArray
     dof: FloatArray
+    sweep: bool
     quality: dict[str, Any]
 
 
-def measure(segment: Segment, settings: Settings, *, sweep: bool = False) -> Point:
-    """Return the point of a segment of known phase."""
+def measure(
+    segment: Segment, settings: Settings, samples: Samples, *, sweep: bool = False
+) -> Point:
+    """Return the point of a segment of known phase; `samples` are those of the whole record."""
     if settings.of_displacement and settings.integrations and 0 in settings.harmonics:
         raise ExtractionError(
             f"the mean of a displacement is not known from its {settings.motion_channel}; leave 0 "
@@ -95,7 +110,8 @@ def measure(segment: Segment, settings: Settings, *, sweep: bool = False) -> Poi
         )
     whole = segment.last_cycles(cycles)
     first = whole.first_cycles(MOST_CYCLES)
-    steps = np.array([sensor_step(channel) for channel in whole.channels])
+    recorded = samples.of(whole)
+    steps = np.array([sensor_step(channel) for channel in recorded.channels])
     rough = sine_fit(first.thinned(), trend=sweep, most=HARMONICS)
     names = (settings.motion_channel, "force")
     for name, amplitude, step in zip(names, np.abs(rough.phasors(1)), steps, strict=True):
@@ -113,16 +129,18 @@ def measure(segment: Segment, settings: Settings, *, sweep: bool = False) -> Poi
     settled = rough
     if steady is not first:
         settled = sine_fit(steady.thinned(), trend=sweep, most=HARMONICS)
-    _check_share(settled, steady, settings)
+    _check_share(settled, steady, settings, samples.lost_variance(first))
     dropped = 0 if sweep else settings.settling_periods or 0
     find_settling = settings.settling_periods is None and not sweep
     if find_settling and transient.significant and cycles > FEWEST_CYCLES:
         n, fundamental = min(cycles, MOST_CYCLES), replace(settings, harmonics=(1,))
-        phasors = Phasors.of(rough.segment, transient, n, fundamental, steps)
+        phasors = Phasors.of(rough.segment, transient, n, fundamental, steps, recorded)
         dropped = _settling_periods(phasors, cycles)
     used = whole.last_cycles(cycles - dropped)
-    phasors = Phasors.of(used, transient, cycles - dropped, settings, steps, sweep=sweep)
-    _check_share(phasors.fit, phasors.fit.segment, settings)
+    phasors = Phasors.of(
+        used, transient, cycles - dropped, settings, steps, samples.of(used), sweep=sweep
+    )
+    _check_share(phasors.fit, phasors.fit.segment, settings, samples.lost_variance(used))
     return _point(phasors, cycles, dropped)
 
 
@@ -130,8 +148,8 @@ def _where(segment: Segment) -> str:
     return f"around t = {segment.centre:.6g} s, {segment.omega / (2.0 * np.pi):.6g} Hz"
 
 
-def _check_share(fit: SineFit, segment: Segment, settings: Settings) -> None:
-    shares = fundamental_share(fit, segment)
+def _check_share(fit: SineFit, segment: Segment, settings: Settings, lost: FloatArray) -> None:
+    shares = fundamental_share(fit, segment, lost)
     for name, share in zip((settings.motion_channel, "force"), shares, strict=True):
         if share < settings.min_share:
             raise ExtractionError(
@@ -156,8 +174,10 @@ def _settling_periods(phasors: Phasors, cycles: int) -> int:
 
 def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
     """Return the point of phasors, with its verdicts; `dropped` of `cycles` were left out."""
-    response, joint, dof = phasors.rows()
-    segment = phasors.fit.segment
+    distorted = phasors.distorted
+    response, joint, dof = phasors.rows(distorted)
+    no_noise = {k: LineNoise(np.zeros_like(n.lines), n.dof) for k, n in phasors.noise.items()}
+    segment, recorded = phasors.fit.segment, phasors.samples.time
     transient, bias, lag = phasors.transient, phasors.bias, phasors.lag
     components = np.where(np.equal(phasors.harmonics, 0), 1.0, 2.0)  # a mean is a real number
     variance = np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) / components
@@ -177,8 +197,8 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
         "num_periods": cycles,
         "settling_periods": dropped,
         "covariance_from": "cycles" if phasors.cycles >= CYCLES_FOR_SCATTER else "spectrum",
-        "start_time": segment.time[0],
-        "end_time": segment.time[-1],
+        "start_time": recorded[0],
+        "end_time": recorded[-1],
         **phasors.channel_quality(),
     }
     by_harmonic = dict(zip(phasors.harmonics, settled.tolist(), strict=True))
@@ -196,7 +216,9 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
         harmonic=phasors.harmonics,
         response=response,
         joint=joint,
+        repeating=replace(phasors, noise=no_noise).rows(distorted)[1],
         dof=dof,
+        sweep=bool(phasors.fit.trending),
         quality=quality | {"verdict": verdicts},
     )
 
@@ -204,7 +226,7 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
 def record_response(
     pieces: Iterable[Record], settings: Settings, level: ArrayLike | None, run: str | None
 ) -> FrequencyResponse:
-    """Return the points of a record in pieces."""
+    """Return the points of a record in pieces; a level in two pieces becomes one point."""
     points: list[Point] = []
     refused: list[str] = []
     noted: dict[str, None] = {}  # warnings of the reader
@@ -215,7 +237,7 @@ def record_response(
             next_points, reasons = _points(record, settings)
         except ExtractionError as exc:
             next_points, reasons = [], [str(exc)]
-        points += next_points
+        points = joined(points, next_points)
         refused += reasons
     provenance = dict(record.provenance or {})
     file = f"{provenance['file']}: " if "file" in provenance else ""
@@ -234,8 +256,8 @@ def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]
     """Return the points, at least one, and the reasons why other segments give none."""
     frequency, mode = settings.frequency, settings.mode
     time = record.time if record.time[0] == 0.0 else record.time - record.time[0]
-    channels = np.stack([record.motion_samples, record.force_samples])
-    motion = channels[0]
+    samples = Samples(time, np.stack([record.motion_samples, record.force_samples]))
+    motion = samples.channels[0]
     runs = find_cycles(time, motion, frequency)
     points: list[Point] = []
     refused: list[str] = []
@@ -243,10 +265,12 @@ def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]
         spans = record_spans(time, motion, runs, frequency, mode, settings.num_periods)
     except ExtractionError as exc:
         spans, refused = [], [str(exc)]
+    block = samples.block_size(max(s.frequency_hz for s in spans)) if spans else 1
+    means = samples.means(block)
     for span in spans:
         try:
-            segment = segment_of(time, channels, span, frequency)
-            points.append(measure(segment, settings, sweep=span.sweep))
+            segment = segment_of(means.time, means.channels, span, frequency, block)
+            points.append(measure(segment, settings, samples, sweep=span.sweep))
         except ExtractionError as exc:
             refused.append(str(exc))
     if frequency is None:
@@ -402,4 +426,71 @@ def _table(
         drive_factor_uncertainty=uncertainty,
         quality={name: per_row(name) for name in points[0].quality},
         provenance=provenance,
+    )
+
+
+def joined(points: list[Point], next_points: list[Point]) -> list[Point]:
+    """Return the points of one piece and of the next; a level in both pieces is one point."""
+    if not points or not next_points:
+        return [*points, *next_points]
+    a, b = points[-1], next_points[0]
+    missing = (b.quality["start_time"] - a.quality["end_time"]) * a.frequency_hz
+    one_level = (
+        not (a.sweep or b.sweep)
+        and a.harmonic == b.harmonic
+        and missing < _MISSING_CYCLES + b.quality["settling_periods"]
+        and abs(np.log(b.amplitude / a.amplitude)) < AMPLITUDE_TOLERANCE
+        and abs(np.log(b.frequency_hz / a.frequency_hz)) < FREQUENCY_TOLERANCE
+    )
+    if not one_level:
+        return [*points, *next_points]
+    return [*points[:-1], _combined(a, b), *next_points[1:]]
+
+
+def _combined(a: Point, b: Point) -> Point:
+    """Return one point for two parts of a level."""
+    periods = a.quality["num_periods"] + b.quality["num_periods"]
+    settling = a.quality["settling_periods"] + b.quality["settling_periods"]
+    if b.quality["settled"].all() and not a.quality["settled"].all():
+        settling = a.quality["num_periods"] + b.quality["settling_periods"]
+        counts = {"num_periods": periods, "settling_periods": settling}
+        return replace(b, quality=b.quality | counts)
+    used = [p.quality["num_periods"] - p.quality["settling_periods"] for p in (a, b)]
+    weights = np.array(used, dtype=np.float64) / sum(used)
+
+    def mean(of_a: Any, of_b: Any) -> Any:
+        return weights[0] * of_a + weights[1] * of_b
+
+    repeating = mean(a.repeating, b.repeating)
+    separate = [w**2 * (p.joint - p.repeating) for w, p in zip(weights, (a, b), strict=True)]
+    # degrees of freedom by the Welch-Satterthwaite formula
+    traces = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in separate]
+    inverse_dof = sum((t / sum(traces)) ** 2 / p.dof for t, p in zip(traces, (a, b), strict=True))
+    verdicts = []
+    for both in zip(a.quality["verdict"], b.quality["verdict"], strict=True):
+        objections = dict.fromkeys(part for text in both for part in text.split("; "))
+        verdicts.append("; ".join(part for part in objections if part != "good") or "good")
+    quality = {
+        **a.quality,
+        **{
+            name: mean(value, b.quality[name])
+            for name, value in a.quality.items()
+            if np.asarray(value).dtype.kind == "f"
+        },
+        "settled": a.quality["settled"] & b.quality["settled"],
+        "more_periods": np.maximum(a.quality["more_periods"], b.quality["more_periods"]),
+        "num_periods": periods,
+        "settling_periods": settling,
+        "start_time": a.quality["start_time"],
+        "end_time": b.quality["end_time"],
+        "verdict": verdicts,
+    }
+    means = ("frequency_hz", "amplitude", "drive", "response")
+    return replace(
+        a,
+        **{name: mean(getattr(a, name), getattr(b, name)) for name in means},
+        joint=separate[0] + separate[1] + repeating,
+        repeating=repeating,
+        dof=np.asarray(1.0 / inverse_dof),
+        quality=quality,
     )

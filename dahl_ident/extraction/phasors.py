@@ -25,7 +25,7 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray, positive_number, w
 from dahl_ident.data.columns import CONTROLLED, one_of, set_checked
 from dahl_ident.data.plausibility import creates_energy
 from dahl_ident.errors import ValidationError
-from dahl_ident.extraction.cycles import MODES, Mode
+from dahl_ident.extraction.cycles import MODES, Mode, scattered
 from dahl_ident.extraction.segment_quality import (
     BY_CHANCE,
     EVEN,
@@ -42,8 +42,10 @@ from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
     HARMONICS,
     LineNoise,
+    Samples,
     Segment,
     SineFit,
+    columns,
     line_noise,
     sine_fit,
 )
@@ -55,6 +57,7 @@ _MOVING_MEAN = 0.02  # drift of the mean over the amplitude, if the force is con
 _BEYOND_NOISE = 5.0  # standard errors above which a drift is more than noise
 _LEAST_RESPONSE_STD = 1e-9  # least relative standard deviation of a response
 _ALIASED = 0.01  # alias as a fraction of the fundamental above which it is reported
+_RESIDUAL_SAMPLES = 10_000  # most samples from which the residual is computed
 _FEW_STEPS = 10.0  # amplitude in steps of the sensor below which rounding matters
 Row = tuple[complex, FloatArray, FloatArray, float]
 """A response, its covariance, its covariance with the reference's size, and degrees of freedom."""
@@ -124,8 +127,7 @@ class Phasors:
     transient: Transient
     transient_derivatives: ComplexArray
     steps: FloatArray
-    recorded: FloatArray
-    """Both channels with the transient, (2, n)."""
+    samples: Samples
 
     @classmethod
     def of(
@@ -135,6 +137,7 @@ class Phasors:
         cycles: int,
         settings: Settings,
         steps: FloatArray,
+        samples: Samples,
         *,
         sweep: bool = False,
     ) -> Phasors:
@@ -144,7 +147,7 @@ class Phasors:
         orders = [k for k in orders if k <= fit.orders]
         noise = dict(zip(orders, line_noise(fit, orders, cycles, fit.residual), strict=True))
         derivatives = transient.phasor_derivatives(fit)
-        return cls(fit, cycles, settings, noise, transient, derivatives, steps, segment.channels)
+        return cls(fit, cycles, settings, noise, transient, derivatives, steps, samples)
 
     @property
     def harmonics(self) -> list[int]:
@@ -183,8 +186,17 @@ class Phasors:
         """RMS error of a phasor of the motion channel and of the force due to quantisation."""
         if not self.steps.any():
             return np.zeros(2)
-        residual, amplitudes = np.sqrt(self.fit.residual_variance), np.abs(self.fit.phasors(1))
-        samples = self.fit.segment.time.size
+        fit, segment = self.fit, self.fit.segment
+        residual = np.sqrt(fit.residual_variance)  # of single samples
+        if segment.block > 1:
+            time = scattered(self.samples.time, _RESIDUAL_SAMPLES)
+            chosen = segment.with_samples(time, scattered(self.samples.channels, _RESIDUAL_SAMPLES))
+            tau = (time - segment.centre) / segment.half_width
+            sine = fit.coefficients.T @ columns(chosen.theta, tau, fit.orders, fit.trending)
+            errors = without(self.transient, chosen, self.settings).channels - sine
+            residual = np.sqrt(np.mean(errors**2, axis=1))
+        amplitudes = np.abs(fit.phasors(1))
+        samples = self.samples.time.size
         return quantisation_errors(amplitudes, self.steps, residual, samples / self.cycles)
 
     @cached_property
@@ -296,7 +308,7 @@ class Phasors:
         cross = np.array([product.real, product.imag])
         return N, 0.5 * variance * np.eye(2), cross, self.noise[1].dof
 
-    def harmonic(self, k: int) -> Row:
+    def harmonic(self, k: int, distorted: float) -> Row:
         """Return the row of a higher harmonic, or of the mean."""
         noise = self.noise[k]
         A, N = abs(self.fundamentals[self.reference]), self.response(k)
@@ -307,7 +319,7 @@ class Phasors:
         of_output = float(self.variance(k)[1 - self.reference]) * scale**2
         if k == 0:
             of_output += (self.transient_std(0) * scale) ** 2
-        of_output += (self.distorted * abs(self.response(1))) ** 2
+        of_output += (distorted * abs(self.response(1))) ** 2
         covariance = 0.5 * of_output * np.eye(2) if k else np.diag([of_output, 0.0])
         outer = np.outer(radial, radial) + k**2 * np.outer(tangential, tangential)
         covariance = covariance + relative * outer
@@ -316,9 +328,9 @@ class Phasors:
         dof = 1.0 / (share**2 / noise.dof + (1.0 - share) ** 2 / self.noise[1].dof)
         return N, covariance, -radial * relative * A, dof
 
-    def rows(self) -> tuple[ComplexArray, FloatArray, FloatArray]:
+    def rows(self, distorted: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
         """Return the responses, their joint covariance with the reference's size, and dof."""
-        rows = [self.fundamental if k == 1 else self.harmonic(k) for k in self.harmonics]
+        rows = [self.fundamental if k == 1 else self.harmonic(k, distorted) for k in self.harmonics]
         response, covariance, cross, dof = (np.array(column) for column in zip(*rows, strict=True))
         joint = np.empty((len(rows), 3, 3))
         joint[:, 0, 0] = self.reference_variance
@@ -348,11 +360,11 @@ class Phasors:
     def channel_quality(self) -> dict[str, Any]:
         """Return the columns that judge the two waveforms."""
         fit, steps = self.fit, self.steps
-        shares = fundamental_share(fit, fit.segment)
-        amplitudes = np.abs(fit.phasors(1))
-        crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase)
+        shares = fundamental_share(fit, fit.segment, self.samples.lost_variance(fit.segment))
+        amplitudes, block = np.abs(fit.phasors(1)), fit.segment.block
+        crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase / block)
         longest = (crest, np.inf)
-        clipped = list(map(clipped_share, self.recorded, steps, longest))
+        clipped = list(map(clipped_share, self.samples.channels, steps, longest))
         with np.errstate(divide="ignore"):
             in_steps = amplitudes / steps
         return {
@@ -378,7 +390,7 @@ class Phasors:
         fit = self.fit
         aliased = alias_error(fit, 1, self.cycles) > _ALIASED * np.abs(fit.phasors(1))
         if aliased.any() or has_unmeasured_aliases(fit, self.cycles):
-            samples = 2.0 * np.pi / fit.segment.sample_phase
+            samples = 2.0 * np.pi / fit.segment.sample_phase * fit.segment.block
             objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
         reference = ("displacement", "force")[self.reference]  # assumed to be a sine
         distorted = quality[f"{reference}_distortion"]

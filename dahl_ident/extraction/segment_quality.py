@@ -128,15 +128,15 @@ def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
     return float(2.0 * np.arccos(1.0 - below) / sample_phase) + 1.0
 
 
-def fundamental_share(fit: SineFit, segment: Segment) -> FloatArray:
+def fundamental_share(fit: SineFit, segment: Segment, lost: FloatArray) -> FloatArray:
     """Return the fundamental's share of the power of each channel without offset and drift.
 
-    `fit` may be one of thinned samples.
+    `fit` may be one of block means; `lost` is the variance that the segment's block means lack.
     """
     sine = 0.5 * np.abs(fit.phasors(1)) ** 2
     drift = fit.coefficients[1] ** 2 / 3.0
-    others = np.maximum(np.var(segment.channels, axis=1) - drift - sine, 0.0)
-    n = segment.time.size
+    others = np.maximum(np.var(segment.channels, axis=1) + lost - drift - sine, 0.0)
+    n = segment.time.size * segment.block
     others *= n / max(n - _FITTED, 1)
     return np.asarray(sine / (sine + others))
 
@@ -186,6 +186,9 @@ def alias_error(fit: SineFit, harmonic: int, cycles: int) -> FloatArray:
     clear = size**2 > _CLEAR * np.outer(variance, fit.residual_variance)
     aliased = np.array([whole - harmonic, whole + harmonic])
     both = [_extrapolated(fitted[c], s[c], aliased) for c, s in zip(clear.T, size.T, strict=True)]
+    factors = fit.segment.attenuation(int(aliased[1]))
+    if factors is not None:
+        both = [size * np.abs(factors[aliased - 1]) for size in both]
     return np.asarray(_leakage(per_cycle, cycles) * np.hypot.reduce(both, axis=1))
 
 

@@ -109,9 +109,9 @@ def _strongest_line(time: FloatArray, motion: FloatArray) -> float:
 
 
 def segment_of(
-    time: FloatArray, channels: FloatArray, span: Span, frequency: float | None
+    time: FloatArray, channels: FloatArray, span: Span, frequency: float | None, block: int = 1
 ) -> Segment:
-    """Return the samples of a span with their phase."""
+    """Return the samples of a span, or means of a block of them, with their phase."""
     first, last = np.searchsorted(time, [span.start, span.stop]).tolist()
     if last - first < 2:
         raise ExtractionError(
@@ -120,7 +120,7 @@ def segment_of(
             f"{argument('frequency')}"
         )
     omega = 2.0 * np.pi * (span.frequency_hz if frequency is None else frequency)
-    segment = steady_segment(time[first:last], channels[:, first:last], omega)
+    segment = steady_segment(time[first:last], channels[:, first:last], omega, block)
     if span.sweep:
         return track_phase(segment, _SWEEP_DEGREE)
     if frequency is not None and segment.whole_cycles < FEWEST_CYCLES:
@@ -134,7 +134,7 @@ def segment_of(
     part = _steady_part(time, channels[0], segment, slice(first, last), room)
     if part == slice(first, last):
         return segment
-    segment = steady_segment(time[part], channels[:, part], segment.omega)
+    segment = steady_segment(time[part], channels[:, part], segment.omega, block)
     return segment if frequency is not None else estimate_frequency(segment)
 
 

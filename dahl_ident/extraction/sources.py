@@ -28,7 +28,7 @@ from dahl_ident.units import percent
 
 Records = Record | PathLike | Sequence[Record | PathLike] | Mapping[str, Record | PathLike]
 _PATTERN = re.compile(r"[*?\[]")
-_PIECE = 4_000_000  # samples: about 0.6 GB while they are extracted
+_PIECE = 10_000_000  # samples: about 0.6 GB while they are extracted
 
 
 def extract(
@@ -59,8 +59,8 @@ def extract(
         integrated at the fitted frequency. A path is a file, or a pattern such as
         ``"day1/*.csv"``. Several records, in a list or a mapping from names, each become a `run`,
         named as in the mapping or after the file. A long file is read and extracted in pieces of
-        4,000,000 samples (HDF5, TDMS, Parquet and npy files stay on the disk); a level in two
-        pieces is two points, without the cycle at the cut.
+        10,000,000 samples (HDF5, TDMS, Parquet and npy files stay on the disk); a level in two
+        pieces is one point, without the cycle at the cut.
     columns : mapping or path of a TOML file, optional
         Column map for files, as for :func:`dahl_ident.read_record`.
     frequency : float, optional
