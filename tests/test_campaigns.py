@@ -126,7 +126,7 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "per": ({"output__per": "day"}, "expected one of device, run"),
     "folder": ({"output__folder": 3}, "expected the path of a folder"),
     "reports": ({"output__reports": "no"}, "expected true or false"),
-    "date": ({"fit__noise": date(2026, 1, 1)}, "a date or a time"),
+    "date": ({"fit__noise": date(2026, 1, 1)}, "fit.noise is .*; expected text in quotes"),
     "law": ({"model": [{"kind": "dal"}]}, "^the campaign: .*did you mean 'dahl'"),
     "laws' path": ({"laws": "\0"}, "^the campaign: .*: the file of laws cannot be read: embedded"),
     "folder's path": ({"output__folder": "\0"}, "the folder cannot be made: embedded null"),

@@ -443,13 +443,15 @@ class TestRefusal:
         ("columns", "message"),
         [
             ({"froce": "F"}, "columns: unknown entry 'froce'; expected one of time, displacement"),
-            ({"force": 3}, "force: column is 3; expected a column's name"),
             (
                 {"force": {"col": "F"}},
                 "columns: force: unknown entry 'col'; .*did you mean 'column'",
             ),
             ({"force": {"unit": 3}}, "force: unit is 3; expected text"),
             ({"force": {"column": "F", "sign": 2}}, "force: sign is 2; expected 1 or -1"),
+            ({"force": {"column": "F", "sign": True}}, "force: sign is True; expected a whole"),
+            ({"force": 3}, "force is 3; expected a column's name, or a table"),
+            ({"force": {"column": len}}, "force: column is <built-in .*; expected text in quotes"),
             ({"force": {"column": "F", "factor": -2}}, "force: factor is -2.0"),
             ({"force": "load"}, r"no column is called 'load'; there are time, x, F"),
             ({"velocity": {"unit": "mm/s"}}, "no column is called velocity or vel or v"),

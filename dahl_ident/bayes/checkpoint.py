@@ -110,7 +110,7 @@ def _read(path: Path) -> tuple[Chain, dict[str, str]]:
         with h5py.File(path, "r") as file:
             text, seed, stated = (file.attrs[name] for name in ("identity", "seed", "digest"))
             values = [file[name][()] for name in _ARRAYS]
-    except (OSError, KeyError, RuntimeError) as exc:
+    except (OSError, KeyError, RuntimeError, TypeError) as exc:
         raise SamplingError(
             f"{path} cannot be read as a chain ({exc}); it is damaged or of another kind. Give "
             "another file; this one was not changed"

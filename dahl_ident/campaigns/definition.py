@@ -143,12 +143,6 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         path = Path(source)
         content = read_toml(path, "the campaign")
         name, folder = str(path), path.resolve().parent
-    try:
-        json.dumps(content)
-    except TypeError as exc:
-        raise DataError(
-            f"{name}: an option is a date or a time; expected a number or a text in quotes ({exc})"
-        ) from exc
     known = checked(_Content, content, name)
     try:
         return _definition(name, folder, known)

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import starmap
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +45,16 @@ from dahl_ident.data.entries import checked, expecting
 from dahl_ident.data.raw_columns import RawChannel, RawFile, plain
 from dahl_ident.data.storage import read_toml
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import ANY, DataError, DataWarning, UnitError, argument, choices, spelled
+from dahl_ident.errors import (
+    ANY,
+    DataError,
+    DataWarning,
+    UnitError,
+    ValidationError,
+    argument,
+    choices,
+    spelled,
+)
 from dahl_ident.units import (
     MECHANICAL_KINDS,
     QUANTITIES,
@@ -68,10 +77,12 @@ class MappedColumn:
 
     column: str | None = expecting("a column's name", default=None)
     unit: str | None = None
-    sign: Literal[1, -1] = 1
+    sign: int = 1
     factor: float = 1.0
 
     def __post_init__(self) -> None:
+        if self.sign not in (1, -1):
+            raise ValidationError(f"sign is {self.sign}; expected 1 or -1")
         set_checked(self, positive_number, "factor")
 
 
@@ -139,6 +150,11 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
     roles: dict[str, MappedColumn] = {}
     settings: dict[str, Any] = {}
     for key, entry in entries.items():
+        if key in FILE_COLUMNS and key not in SETTINGS and not isinstance(entry, (str, Mapping)):
+            raise DataError(
+                f"{name}: {key} is {entry!r}; expected a column's name, or a table with column, "
+                "unit, sign and factor"
+            )
         column = entry if isinstance(entry, Mapping) else {"column": entry}
         if key in SETTINGS and not (key in FILE_COLUMNS and entry is column and "column" in entry):
             settings[key] = entry

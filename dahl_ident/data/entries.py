@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any, TypeVar, get_args, get_type_hints
 
-from dahl_ident.data.storage import plain_data
+import numpy as np
+
 from dahl_ident.errors import DataError, choices
 
 _T = TypeVar("_T")
@@ -32,11 +34,33 @@ def checked(kind: type[_T], entries: Any, where: str) -> _T:
 
     mapping = dict[str, kind]  # type: ignore[valid-type]  # a dataclass itself takes no options
     adapter = TypeAdapter(mapping, config={"extra": "forbid", "strict": True})
-    content = plain_data(entries)
-    try:  # as JSON, because strict types take no mapping of Python for a dataclass
-        return adapter.validate_json(json.dumps({where: content}))[where]
+    try:
+        content = _plain(entries, where)
+        # as JSON, because strict types take no mapping of Python for a dataclass
+        return adapter.validate_json(json.dumps({"": content}))[""]
     except ValidationError as exc:
         raise DataError(_message(kind, content, where, exc.errors(include_url=False))) from exc
+    except RecursionError as exc:
+        raise DataError(
+            f"{where}: tables or lists are nested too deeply, or hold themselves"
+        ) from exc
+
+
+def _plain(value: Any, place: str, separator: str = ": ") -> Any:
+    """Return dictionaries, lists, text and numbers; refuse anything else, such as a date."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v, f"{place}{separator}{k}", ".") for k, v in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, complex):
+        value = [value.real, value.imag]
+    if isinstance(value, (list, tuple)):
+        return [_plain(v, f"{place}[{i}]", ".") for i, v in enumerate(value)]
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    if value is None or isinstance(value, (str, float, int)):
+        return value
+    raise DataError(f"{place} is {value!r}; expected text in quotes, a number, a list or a table")
 
 
 def expecting(description: str, **options: Any) -> Any:

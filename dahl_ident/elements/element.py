@@ -459,7 +459,7 @@ def describe_model(model: Element) -> list[dict[str, Any]]:
     return [_describe(element) for element in as_model(model).elements]
 
 
-def model_from_description(description: Iterable[Mapping[str, Any]]) -> Model:
+def model_from_description(description: list[Mapping[str, Any]]) -> Model:
     """Return the model that :func:`describe_model` described.
 
     Examples
@@ -467,6 +467,8 @@ def model_from_description(description: Iterable[Mapping[str, Any]]) -> Model:
     >>> model_from_description([{"kind": "spring", "stiffness": "free"}])
     Spring(stiffness=free)
     """
+    if not isinstance(description, Iterable):
+        raise ModelError(f"the model is {description!r}; expected a list of elements")
     return Model(*(_build(entry) for entry in description))
 
 
@@ -480,6 +482,8 @@ def _describe(element: Element) -> dict[str, Any]:
 
 
 def _build(entry: Mapping[str, Any]) -> Element:
+    if not isinstance(entry, Mapping):
+        raise ModelError(f"the element is {entry!r}; expected its kind and values by name")
     content = dict(entry)
     kind = content.pop("kind", None)
     cls = class_named(str(kind))

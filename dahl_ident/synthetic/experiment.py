@@ -155,7 +155,7 @@ class Experiment:
                 f"the excitation has the kind {kind!r}; expected one of "
                 f"{choices(_EXCITATIONS, kind)}"
             )
-        plant = model_from_description(known.plant)
+        plant = model_from_description([*known.plant])
         excitation = checked(_EXCITATIONS[kind], known.excitation, "the excitation")
         return cls(**{**vars(known), "plant": plant, "excitation": excitation})
 
