@@ -142,7 +142,7 @@ def test_other_hdf5_files_are_refused(tmp_path):
     path = tmp_path / "table.h5"
     with h5py.File(path, "w") as file:
         file["amplitude"] = np.ones(3)
-    refused(path, "cannot be read as a chain")
+    refused(path, f"^{path} is an HDF5 file, but not a chain that this version can resume")
 
 
 def test_two_runs_exclude_each_other(tmp_path):

@@ -115,8 +115,8 @@ def run(
     verdict: Convergence | None = None
     sampler = _sampler(density, settings, pool)
     end = settings.max_steps if settings.steps is None else settings.steps
-    check = _next_check(chain.steps, end) if settings.steps is None else end
     while True:
+        check = _next_check(chain.steps, end) if settings.steps is None else end
         while chain.steps < check:
             piece = max(_SHORTEST_PIECE, chain.steps // _PIECES)
             chain = _continued(sampler, chain, min(piece, check - chain.steps))
@@ -125,7 +125,8 @@ def run(
         verdict = judge(chain.points, settings.ensembles, settings.ess)
         if chain.steps >= end or verdict.converged:
             return chain, verdict
-        check = _next_check(chain.steps + 1, end)
+        # more steps, without which the next check would be this one again
+        chain = _continued(sampler, chain, min(_SHORTEST_PIECE, end - chain.steps))
 
 
 def _next_check(steps: int, end: int) -> int:

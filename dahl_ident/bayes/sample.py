@@ -176,13 +176,14 @@ def sample_chain(
     with ExitStack() as stack:
         stored = None
         if resume is not None:
-            stored, write = stack.enter_context(open_chain(resume, identity(density, settings)))
+            file = stack.enter_context(open_chain(resume, identity(density, settings)))
+            stored = file.load()
             if stored is not None and seed not in (None, stored.seed):
                 raise SamplingError(
                     f"{os.fspath(resume)} was begun with seed {stored.seed}, but seed is {seed}; "
                     "leave it out to resume, or give another file"
                 )
-            listeners = [*listeners, write]
+            listeners = [*listeners, file]
         random = np.random.default_rng(settings.seed)
         chain = stored or Chain.at(start(settings.walkers, random), settings.seed)
         chain, verdict = run(density, chain, settings, listeners, pool)
