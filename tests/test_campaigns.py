@@ -121,7 +121,7 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "covariates' path": ({"files__covariates": 3}, "expected the path of a table"),
     "braces": ({"files__pattern": "{device}_{2}.csv"}, "braces without a name"),
     "no pattern": ({"files": {}}, "files has no pattern; expected text such as 'data/{device}"),
-    "laws": ({"laws": 3}, "laws is 3; expected a path, or a list of paths"),
+    "laws": ({"laws": 3}, "laws is 3; expected the path of a Python file, or a list"),
     "no path": ({"output__folder": ""}, "output.folder is ''; expected the path of a folder"),
     "per": ({"output__per": "day"}, "expected one of device, run"),
     "folder": ({"output__folder": 3}, "expected the path of a folder"),

@@ -193,7 +193,7 @@ def test_a_campaign_takes_it_to_its_workers(file, run):
     redone = di.campaign(lab, jobs=1, redo=True)
     assert redone.table["k"].to_numpy() == pytest.approx([15.0, 15.0], rel=0.02)
     lab.write_text(f"laws = 3\n{lab.read_text().partition(chr(10))[2]}")
-    with pytest.raises(DataError, match="laws is 3; expected a path, or a list of paths"):
+    with pytest.raises(DataError, match="laws is 3; expected the path of a Python file, or a list"):
         di.campaign(lab)
 
 

@@ -89,7 +89,9 @@ class _Content:
 
     files: _Files
     model: list[dict[str, Any]] = expecting('[[model]] tables, such as kind = "dahl"')
-    laws: str | list[str] = expecting("a path, or a list of paths", default_factory=list)
+    laws: str | list[str] = expecting(
+        "the path of a Python file, or a list of paths", default_factory=list
+    )
     read: dict[str, Any] = field(default_factory=dict)
     extract: dict[str, Any] = field(default_factory=dict)
     fit: dict[str, Any] = field(default_factory=dict)

@@ -150,19 +150,20 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
     roles: dict[str, MappedColumn] = {}
     settings: dict[str, Any] = {}
     for key, entry in entries.items():
-        if key in FILE_COLUMNS and key not in SETTINGS and not isinstance(entry, (str, Mapping)):
+        mapped = key in FILE_COLUMNS and isinstance(entry, Mapping) and "column" in entry
+        if key in SETTINGS and not mapped:
+            settings[key] = entry
+        elif key not in FILE_COLUMNS:
+            known = choices((*FILE_COLUMNS, *SETTINGS), key)
+            raise DataError(f"{name}: unknown entry {key!r}; expected one of {known}")
+        elif not isinstance(entry, (str, Mapping)):
             raise DataError(
                 f"{name}: {key} is {entry!r}; expected a column's name, or a table with column, "
                 "unit, sign and factor"
             )
-        column = entry if isinstance(entry, Mapping) else {"column": entry}
-        if key in SETTINGS and not (key in FILE_COLUMNS and entry is column and "column" in entry):
-            settings[key] = entry
-        elif key in FILE_COLUMNS:
-            roles[key] = checked(MappedColumn, column, f"{name}: {key}")
         else:
-            known = choices((*FILE_COLUMNS, *SETTINGS), key)
-            raise DataError(f"{name}: unknown entry {key!r}; expected one of {known}")
+            column = {"column": entry} if isinstance(entry, str) else entry
+            roles[key] = checked(MappedColumn, column, f"{name}: {key}")
     return replace(checked(ColumnMap, settings, name) if settings else ColumnMap(), roles=roles)
 
 

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
+from dahl_ident.data.storage import plain_data
 from dahl_ident.errors import DataError, choices
 
 _T = TypeVar("_T")
@@ -50,10 +51,8 @@ def _plain(value: Any, place: str, separator: str = ": ") -> Any:
     """Return dictionaries, lists, text and numbers; refuse anything else, such as a date."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v, f"{place}{separator}{k}", ".") for k, v in value.items()}
-    if isinstance(value, (np.ndarray, np.generic)):
-        value = value.tolist()
-    if isinstance(value, complex):
-        value = [value.real, value.imag]
+    if isinstance(value, (np.ndarray, np.generic, complex)):
+        return plain_data(value)
     if isinstance(value, (list, tuple)):
         return [_plain(v, f"{place}[{i}]", ".") for i, v in enumerate(value)]
     if isinstance(value, os.PathLike):
