@@ -83,7 +83,7 @@ class RecordBand:
 
 @dataclass(frozen=True)
 class RecordGoodness(Goodness):
-    """Residuals of all records: their size, and where they are largest."""
+    """Residuals of all records: their size, where they are largest, and their correlation."""
 
     # root mean square over that of the output, at the drive's frequencies where residuals are
     # weighted by their spectrum
@@ -91,6 +91,7 @@ class RecordGoodness(Goodness):
     rms: float = 0.0  # of the residuals, in the output's unit
     worst_record: int = 1  # record, from 1, of the fiftieth of a record with the largest residuals
     worst: str = ""  # that segment in words, with its times in s
+    correlation: float = 0.0  # of residuals of neighbouring samples
 
     @property
     def headline(self) -> str:
@@ -104,6 +105,7 @@ class RecordGoodness(Goodness):
             f"unexplained share of variance {self.rms_misfit**2:.3g} "
             f"({percent(self.rms_misfit)} rms)",
             f"residuals {self.rms:.3g} rms; {self.worst}",
+            f"correlation of neighbouring residuals {self.correlation:.2f}",
         ]
 
 
@@ -142,12 +144,14 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     worst = (
         f"they are largest {when} s{which}, {square**0.5 / rms if rms else 0.0:.2g} times their rms"
     )
+    products = sum(float(e[1:] @ e[:-1]) for e in residuals)
     return RecordGoodness(
         share**0.5,
         rms_in_band=in_band**0.5,
         rms=rms,
         worst_record=number,
         worst=worst,
+        correlation=products / total if total else 0.0,
     )
 
 
