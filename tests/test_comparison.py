@@ -11,7 +11,7 @@ from benchmarks.selection import choices
 from dahl_ident import compare_models, fit
 from dahl_ident.diagnostics.held_out import predictive_density
 from dahl_ident.errors import FitError
-from dahl_ident.fitting.optimum import Status
+from dahl_ident.fitting import Status
 from tests.friction_tables import FRICTION, relative_noise, stated, table
 from tests.histories import integrated_force
 
