@@ -127,6 +127,15 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "folder": ({"output__folder": 3}, "expected the path of a folder"),
     "reports": ({"output__reports": "no"}, "expected true or false"),
     "date": ({"fit__noise": date(2026, 1, 1)}, "fit.noise is .*; expected text in quotes"),
+    "role": (
+        {"read__columns": {"amplitud": "x"}},
+        r"^the campaign: \[read\.columns\]: unknown entry 'amplitud'; .*did you mean 'amplitude'",
+    ),
+    "column": ({"read__columns": {"gain": {"unti": "N"}}}, r"gain: unknown entry 'unti'; .*'unit'"),
+    "unit": ({"read__columns": {"gain": {"unit": "N/mmm"}}}, r"gain: \[N/mmm\] is not a known"),
+    "label": ({"read__columns": {"controlled": {"forse": "d*"}}}, "'forse'; .* mean 'force'"),
+    "columns": ({"read__columns": 3}, r"^the campaign: \[read\.columns\] is 3; expected its path"),
+    "reading": ({"read__controlled": "forse"}, r"^the campaign: \[read\]: controlled is 'forse'"),
     "law": ({"model": [{"kind": "dal"}]}, "^the campaign: .*did you mean 'dahl'"),
     "laws' path": ({"laws": "\0"}, "^the campaign: .*: the file of laws cannot be read: embedded"),
     "folder's path": ({"output__folder": "\0"}, "the folder cannot be made: embedded null"),
@@ -140,6 +149,22 @@ def test_a_wrong_definition_is_named_before_anything_runs(tmp_path, changes, mes
     with pytest.raises(DataError, match=message):
         di.campaign(definition(tmp_path, **changes), jobs=1)
     assert not (tmp_path / "results").exists()
+
+
+def test_a_column_map_is_beside_the_campaign_and_its_changes_are_named(tmp_path, monkeypatch):
+    f_max = make_tables(tmp_path, 1)["f_max"][0]
+    path = as_toml(tmp_path)
+    path.write_text(path.read_text() + '[read]\ncolumns = "columns.toml"\n')
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for folder, factor in ((tmp_path, 2), (Path(), 3)):
+        (folder / "columns.toml").write_text(f"[amplitude]\nfactor = {factor}\n")
+    fit = di.campaign(path, jobs=1).table.iloc[0]
+    # the same stiffness, twice as far
+    assert abs(fit["f_max"] - 2.0 * f_max) < 5.0 * fit["u_f_max"]
+    (tmp_path / "columns.toml").write_text("[amplitude]\nfactor = 4\n")
+    with pytest.raises(DataError, match=r'read was .*"factor": 2.*, now .*"factor": 4'):
+        di.campaign(path, jobs=1)
 
 
 def test_duplicates_and_missing_covariates_are_named(tmp_path):

@@ -40,7 +40,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dahl_ident.data.entries import checked, expecting
-from dahl_ident.data.storage import read_toml, regular
+from dahl_ident.data.storage import path_of, read_toml, regular
 from dahl_ident.errors import DataError, ModelError, ValidationError, choices
 
 _SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "progress"}
@@ -162,7 +162,8 @@ def _definition(name: str, folder: Path, content: _Content) -> Definition:
         "kind": content.files.kind,
         "per": content.output.per,
         "model": model,
-        **{table: getattr(content, table) for table in ("read", "extract", "fit", "posterior")},
+        "read": _reading(folder, content.read, content.files.kind == "record"),
+        **{table: getattr(content, table) for table in ("extract", "fit", "posterior")},
     }
     if laws:
         options["laws"] = laws
@@ -182,6 +183,22 @@ def _model(entries: list[Any]) -> tuple[list[Any], Collection[str], dict[str, st
     files = {file for law in user_laws(model.elements) if (file := file_of(law)) is not None}
     digests = {Path(file.path).name: file.digest for file in sorted(files)}
     return describe_model(model), [p.name for p in model.parameters], digests
+
+
+def _reading(folder: Path, read: Mapping[str, Any], record: bool) -> dict[str, Any]:
+    """Return the options of reading, with the entries of a column map in place of its path."""
+    from dahl_ident.data.column_map import SETTINGS, column_map
+    from dahl_ident.data.columns import RECORD_COLUMNS
+
+    where, options = "[read.columns]", dict(read)
+    columns = options.get("columns")
+    if columns is not None and not isinstance(columns, Mapping):
+        path = folder / path_of(columns, where)
+        options["columns"], where = read_toml(path, "the column map"), str(path)
+    column_map(options.get("columns"), where)
+    entries = (*SETTINGS, *RECORD_COLUMNS) if record else SETTINGS
+    column_map({name: read[name] for name in entries if name in read}, "[read]")
+    return options
 
 
 def _check_options(options: Mapping[str, Any]) -> None:

@@ -34,10 +34,10 @@ import numpy as np
 
 from dahl_ident.arrays import BoolArray, FloatArray, non_negative_number, positive_number
 from dahl_ident.data.columns import (
+    CONTROLLED,
     FILE_COLUMNS,
     RECORD_COLUMNS,
     Column,
-    Controlled,
     one_of,
     set_checked,
 )
@@ -84,6 +84,8 @@ class MappedColumn:
         if self.sign not in (1, -1):
             raise ValidationError(f"sign is {self.sign}; expected 1 or -1")
         set_checked(self, positive_number, "factor")
+        if self.unit:
+            parse_unit(self.unit)
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class ColumnMap:
 
     roles: Mapping[str, MappedColumn] = field(default_factory=dict)
     quantity: Quantity | None = None
-    controlled: Controlled | dict[Controlled, str] | None = expecting(
+    controlled: str | dict[str, str] | None = expecting(
         "'displacement' or 'force', or a pattern of level labels for each of them", default=None
     )
     sweep: str | None = None
@@ -102,6 +104,9 @@ class ColumnMap:
 
     def __post_init__(self) -> None:
         set_checked(self, partial(one_of, allowed=QUANTITIES), "quantity")
+        words = [self.controlled] if isinstance(self.controlled, str) else self.controlled or ()
+        for word in words:
+            one_of(word, "controlled", CONTROLLED)
         set_checked(self, positive_number, "sample_rate")
         set_checked(self, non_negative_number, "drive_factor_uncertainty")
 
@@ -141,9 +146,14 @@ def proposal() -> str:
     return spelled(hint, hint, "")
 
 
-def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
-    """Read a column map from a mapping or a TOML file; `overrides` replace its entries."""
-    name, entries = "columns", value or {}
+def column_map(
+    value: Mapping[str, Any] | str | Path | None, name: str = "columns", **overrides: Any
+) -> ColumnMap:
+    """Read a column map from a mapping or a TOML file; `overrides` replace its entries.
+
+    Messages call a mapping `name`.
+    """
+    entries = value or {}
     if not isinstance(entries, Mapping):
         name, entries = str(entries), read_toml(entries, "the column map")
     entries = {**entries, **{key: entry for key, entry in overrides.items() if entry is not None}}
@@ -154,7 +164,7 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
         if key in SETTINGS and not mapped:
             settings[key] = entry
         elif key not in FILE_COLUMNS:
-            known = choices((*FILE_COLUMNS, *SETTINGS), key)
+            known = choices(dict.fromkeys((*FILE_COLUMNS, *SETTINGS)), key)
             raise DataError(f"{name}: unknown entry {key!r}; expected one of {known}")
         elif not isinstance(entry, (str, Mapping)):
             raise DataError(
