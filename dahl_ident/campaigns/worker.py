@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -149,15 +149,15 @@ def _response(
 def _on_disk(job: Job, digests: list[str]) -> Iterator[list[Path]]:
     """Yield the paths of the files, and append their digests to a list.
 
-    Files that were sent with the job are in a folder that is removed afterwards.
+    A file that was sent with the job is in a folder that is removed afterwards.
     """
-    with TemporaryDirectory(prefix="campaign_") as folder:
+    with ExitStack() as folders:
         paths = []
-        for index, (name, content) in enumerate(job.files):
+        for name, content in job.files:
             path = Path(name)
             if content is not None:
-                path = Path(folder) / str(index) / path.name
-                path.parent.mkdir()
+                folder = folders.enter_context(TemporaryDirectory(prefix="campaign_"))
+                path = Path(folder) / path.name
                 path.write_bytes(content)
             paths.append(path)
             digests.append(digest_of(path))
