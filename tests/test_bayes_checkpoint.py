@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.errors import SamplingError
+from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.problem import TableProblem
 from tests.bayes_cases import friction_table
 
@@ -168,6 +168,8 @@ def test_a_lock_left_by_a_killed_run_does_not_matter(tmp_path):
 
 
 def test_a_missing_folder_and_a_folder_are_said(tmp_path):
+    with pytest.raises(ValidationError, match="resume is 3; expected its path"):
+        sampled(3, steps=50)
     with pytest.raises(SamplingError, match="is a folder; give the path of a file in it"):
         sampled(tmp_path, steps=50)
     with pytest.raises(SamplingError, match="nowhere is not a folder; make it"):

@@ -105,10 +105,11 @@ def test_description_comes_back(law):
     [
         control.tf([2.0], [0.3, 0.24, 0.3]),
         control.ss([[0.0, 1.0], [-1.0, -0.8]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.1]]),
+        control.tf([2], [1, 3], None),
         control.tf([1.0, 0.2], [1.0, -0.5], 1e-3),
         control.FRD(np.array([1.0 + 1.0j, 0.5j, 0.1, 0.01j]), [1.0, 10.0, 100.0, 500.0]),
     ],
-    ids=["transfer function", "state space", "discrete", "FRD"],
+    ids=["transfer function", "state space", "whole numbers", "discrete", "FRD"],
 )
 def test_descriptions_of_linear_systems_come_back(system):
     model, omega = di.LinearSystem(system, quantity="receptance", name="plate"), [1.0, 20.0, 300.0]
@@ -133,7 +134,20 @@ def test_a_function_has_no_description():
         ),
         ({"kind": "mass", "m": 1.0}, "the mass element has the keys m; expected mass"),
         ({"kind": "mass", "mass": {"strat": 1.0}}, "mass has the key 'strat'; .* mean 'start'"),
-        ({"kind": "linear_system", "quantity": "receptance"}, "the linear_system element has no A"),
+        (
+            {"kind": "linear_system", "quantity": "receptance"},
+            r"model\[0\]: the linear_system element has the keys quantity; expected quantity",
+        ),
+        (
+            {"kind": "linear_system", "quantity": "receptance", "dt": 0}
+            | {"numerator": "2", "denominator": [1]},
+            "the linear_system element cannot be built",
+        ),
+        (
+            {"kind": "linear_system", "quantity": "receptance", "dt": 0}
+            | {"numerator": [2], "denominator": [1, 3], "nmae": "plate"},
+            "has the keys quantity, dt, numerator, denominator, nmae; expected quantity",
+        ),
     ],
 )
 def test_bad_descriptions_name_what_is_wrong(entry, message):

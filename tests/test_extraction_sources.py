@@ -75,6 +75,8 @@ def test_what_is_no_record_and_what_is_not_there(folder):
         extract(str(folder / "nothing*.csv"))
     with pytest.raises(DataError, match=r"low\.csv: the file is named twice"):
         extract([folder / "low.csv", str(folder / "*.csv")])
+    with pytest.raises(DataError, match="is not the name of a file: embedded null byte"):
+        extract("\0")
     with pytest.raises(ValidationError, match="records is empty"):
         extract([])
     with pytest.raises(ValidationError, match="records holds a int"):

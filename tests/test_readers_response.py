@@ -516,6 +516,7 @@ class TestManyFiles:
             ({"level_from_name": "_([0-9.]+)V", "drive": "1 N"}, "finds no group in the name"),
             ({"level_from_name": "_[0-9.]+N", "drive": "1 N"}, "put the level in round"),
             ({"level_from_name": "(", "drive": "1 N"}, "is not a regular expression"),
+            ({"level_from_name": 3}, "level_from_name 3 is not a regular expression"),
             ({"drive": "{level} N"}, "level_from_name gives nothing"),
             ({"drive": "5 um"}, r"drive has the unit \[um\]"),
             ({"sheet": "x", "drive": "1 N"}, "the file is not a workbook"),

@@ -25,7 +25,7 @@ import numpy as np
 
 from dahl_ident.bayes.chain import Chain, ChainSettings, Convergence
 from dahl_ident.bayes.density import LogDensity
-from dahl_ident.data.storage import library, locked, plain_data, put_in_place
+from dahl_ident.data.storage import library, locked, path_of, plain_data, put_in_place
 from dahl_ident.elements.element import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 
@@ -105,7 +105,7 @@ class ChainFile:
 @contextmanager
 def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[ChainFile]:
     """Lock a chain's file for the duration of a run; write the last steps at its end."""
-    file = Path(path)
+    file = path_of(path, "resume")
     if file.is_dir():
         raise SamplingError(f"{file} is a folder; give the path of a file in it")
     if not file.parent.is_dir():

@@ -142,7 +142,7 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
     if isinstance(source, Mapping):
         content, name, folder = dict(source), "the campaign", Path.cwd()
     else:
-        path = Path(source)
+        path = path_of(source, "the campaign")
         content = read_toml(path, "the campaign")
         name, folder = str(path), path.resolve().parent
     known = checked(_Content, content, name)

@@ -37,7 +37,7 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
 
     try:
         content = tomllib.loads(read_text(path))
-    except (DataError, tomllib.TOMLDecodeError) as exc:
+    except (ValueError, RecursionError) as exc:
         raise DataError(f"{path} is not a TOML file of options: {exc}") from exc
     command = ctx.info_name or ""
     tables = {k: v for k, v in content.items() if isinstance(v, dict)}

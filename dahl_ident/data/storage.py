@@ -91,10 +91,18 @@ def read_text(path: str | Path, what: str = "the file") -> str:
 
 def read_toml(path: str | Path, what: str = "the file") -> dict[str, Any]:
     """Return the entries of a TOML file."""
+    content: dict[str, Any] = parsed(
+        tomllib.loads, read_text(path, what), f"{path}: is not a TOML file"
+    )
+    return content
+
+
+def parsed(loads: Callable[[str], Any], text: str, otherwise: str) -> Any:
+    """Return the content of a JSON or TOML text, or raise an error that says what it is not."""
     try:
-        return tomllib.loads(read_text(path, what))
-    except tomllib.TOMLDecodeError as exc:
-        raise DataError(f"{path}: is not a TOML file: {exc}") from exc
+        return loads(text)
+    except (AttributeError, RecursionError, TypeError, ValueError) as exc:
+        raise DataError(f"{otherwise}: {exc}") from exc
 
 
 def refuse_existing(path: Path) -> None:
@@ -173,8 +181,9 @@ def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
         raise error(
             f"another run is writing {file}; wait for its end, or give another file"
         ) from None
-    except OSError as exc:
-        raise error(f"{file} cannot be written: {exc.strerror or exc}") from exc
+    except (OSError, ValueError) as exc:
+        why = getattr(exc, "strerror", None) or exc
+        raise error(f"{file} cannot be written: {why}") from exc
     try:
         yield
     finally:

@@ -459,8 +459,8 @@ def describe_model(model: Element) -> list[dict[str, Any]]:
     return [_describe(element) for element in as_model(model).elements]
 
 
-def model_from_description(description: list[Mapping[str, Any]]) -> Model:
-    """Return the model that :func:`describe_model` described.
+def model_from_description(description: Sequence[Mapping[str, Any]], where: str = "model") -> Model:
+    """Return the model that :func:`describe_model` described; messages call the list `where`.
 
     Examples
     --------
@@ -469,7 +469,13 @@ def model_from_description(description: list[Mapping[str, Any]]) -> Model:
     """
     if not isinstance(description, Iterable):
         raise ModelError(f"the model is {description!r}; expected a list of elements")
-    return Model(*(_build(entry) for entry in description))
+    elements = []
+    for i, entry in enumerate(description):
+        try:
+            elements.append(_build(entry))
+        except (ModelError, ValidationError) as exc:
+            raise type(exc)(f"{where}[{i}]: {exc}") from exc
+    return Model(*elements)
 
 
 def _describe(element: Element) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from dahl_ident.elements.facts import (
     Values,
 )
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, ValidationError, choices
 
 
 class ForceLaw(ABC):
@@ -135,7 +135,7 @@ class ForceLaw(ABC):
         if unknown:
             raise ModelError(
                 f"the {self.kind} element has the keys {', '.join(unknown)}; expected "
-                f"{', '.join(self.labels)}"
+                f"{choices(self.labels, *unknown)}"
             )
         return self.copy_with(
             tuple(

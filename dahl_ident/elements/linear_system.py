@@ -12,7 +12,6 @@ import importlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +41,11 @@ from dahl_ident.units import DEFINITIONS, QUANTITIES, Quantity, converted
 
 _VANISHES = 1e-12  # of the terms of a sum: below it the sum is 0 but for rounding
 _UNSTABLE = 1e-9  # of the fastest pole: with a larger real part, a pole is unstable
+_DESCRIPTIONS = (  # keys of a system as plain data
+    ("omega", "real", "imag"),
+    ("numerator", "denominator", "dt"),
+    ("A", "B", "C", "D", "dt"),
+)
 _FORCE_OVER_MOTION = ("dynamic_stiffness", "mechanical_impedance", "apparent_mass")
 
 
@@ -283,33 +287,32 @@ class LinearSystem(Element):
                 "real": response.real.tolist(),
                 "imag": response.imag.tolist(),
             }
-        entry["dt"] = system.dt
+        entry["dt"] = system.dt or 0  # one without a time base is taken as continuous
         if isinstance(system, control.TransferFunction):
             numerator, denominator = system.num[0][0], system.den[0][0]
-            return entry | {"numerator": list(numerator), "denominator": list(denominator)}
+            return entry | {"numerator": numerator.tolist(), "denominator": denominator.tolist()}
         return entry | {key: np.asarray(getattr(system, key)).tolist() for key in "ABCD"}
 
     @classmethod
     def from_description(cls, description: Mapping[str, Any], name: str | None) -> LinearSystem:
         """Return the linear system that :meth:`describe` described."""
         control = importlib.import_module("control")
-        try:
-            if "omega" in description:
-                parts = itemgetter("real", "imag", "omega")(description)
-                real, imag, omega = (np.asarray(part) for part in parts)
-                system = control.FRD(real + 1j * imag, omega)
-            elif "numerator" in description:
-                parts = itemgetter("numerator", "denominator", "dt")(description)
-                system = control.TransferFunction(*parts)
-            else:
-                parts = itemgetter("A", "B", "C", "D", "dt")(description)
-                system = control.StateSpace(*parts)
-            return cls(system, quantity=description["quantity"], name=name)
-        except KeyError as exc:
+        keys = next((k for k in _DESCRIPTIONS if k[0] in description), _DESCRIPTIONS[-1])
+        if description.keys() != {"quantity", *keys}:
             raise ModelError(
-                f"the linear_system element has no {exc.args[0]}; expected quantity with omega, "
-                "real and imag, with numerator, denominator and dt, or with A, B, C, D and dt"
-            ) from None
+                f"the linear_system element has the keys {', '.join(description)}; expected "
+                f"quantity with {', or with '.join(map(', '.join, _DESCRIPTIONS))}"
+            )
+        parts = [description[key] for key in keys]
+        try:
+            if "omega" in keys:
+                omega, real, imag = map(np.asarray, parts)
+                system = control.FRD(real + 1j * imag, omega)
+            else:
+                system = (control.StateSpace if "A" in keys else control.TransferFunction)(*parts)
+        except Exception as exc:  # python-control raises errors of every kind
+            raise ModelError(f"the linear_system element cannot be built: {exc}") from exc
+        return cls(system, quantity=description["quantity"], name=name)
 
     def system_at(self, values: Sequence[float]) -> Any:
         """Return the python-control system at `values` of the parameters, in their order."""

@@ -63,7 +63,7 @@ def from_json(text: str, source: str = "the text") -> dict[str, Any]:
     """Return the arguments of the fit in JSON text."""
     try:
         content = json.loads(text)
-    except json.JSONDecodeError as exc:
+    except (RecursionError, TypeError, ValueError) as exc:
         raise DataError(f"{source} is not JSON: {exc}; expected a saved fit") from exc
     _check(content, source)
     try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import tomli_w
 
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.entries import checked
-from dahl_ident.data.storage import read_text
+from dahl_ident.data.storage import parsed, path_of, plain_data, read_text
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model, describe_model, model_from_description
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError, choices
@@ -130,14 +130,15 @@ class Experiment:
     def to_dict(self) -> dict[str, Any]:
         """Return the description as plain data; None values are left out."""
         kinds = {cls: kind for kind, cls in _EXCITATIONS.items()}
-        description: dict[str, Any] = {
+        description = {
             "motion": self.motion,
             "plant": describe_model(self.plant),
-            "excitation": {"kind": kinds[type(self.excitation)], **asdict(self.excitation)},
-            "acquisition": asdict(self.acquisition),
-            "table": None if self.table is None else asdict(self.table),
+            "excitation": {"kind": kinds[type(self.excitation)], **_stated(self.excitation)},
+            "acquisition": _stated(self.acquisition),
         }
-        return {k: _plain(v) for k, v in description.items() if v is not None}
+        if self.table is not None:
+            description["table"] = _stated(self.table)
+        return description
 
     @classmethod
     def from_dict(cls, description: Mapping[str, Any]) -> Experiment:
@@ -155,7 +156,7 @@ class Experiment:
                 f"the excitation has the kind {kind!r}; expected one of "
                 f"{choices(_EXCITATIONS, kind)}"
             )
-        plant = model_from_description([*known.plant])
+        plant = model_from_description(known.plant, "plant")
         excitation = checked(_EXCITATIONS[kind], known.excitation, "the excitation")
         return cls(**{**vars(known), "plant": plant, "excitation": excitation})
 
@@ -172,7 +173,7 @@ class Experiment:
         DataError
             If the text is not JSON, or not an experiment.
         """
-        return cls.from_dict(_parsed(json.loads, text, "JSON"))
+        return cls.from_dict(parsed(json.loads, text, "the experiment is not JSON"))
 
     def to_toml(self) -> str:
         """Return the description as TOML."""
@@ -187,7 +188,7 @@ class Experiment:
         DataError
             If the text is not TOML, or not an experiment.
         """
-        return cls.from_dict(_parsed(tomllib.loads, text, "TOML"))
+        return cls.from_dict(parsed(tomllib.loads, text, "the experiment is not TOML"))
 
     @classmethod
     def read(cls, path: str | Path) -> Experiment:
@@ -198,7 +199,7 @@ class Experiment:
         DataError
             If the file cannot be read, or holds no experiment.
         """
-        path = Path(path)
+        path = path_of(path, "the experiment")
         readers = {".toml": cls.from_toml, ".json": cls.from_json}
         if path.suffix not in readers:
             raise DataError(f"{path}: expected an experiment in .toml or .json")
@@ -220,17 +221,7 @@ class Experiment:
         return hash(self.to_json())
 
 
-def _parsed(loads: Callable[[str], Any], text: str, form: str) -> Any:
-    try:
-        return loads(text)
-    except ValueError as exc:
-        raise DataError(f"the experiment is not {form}: {exc}") from exc
-
-
-def _plain(value: Any) -> Any:
-    """Return nested data with lists for tuples and without None."""
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items() if v is not None}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value
+def _stated(settings: Any) -> Any:
+    """Return the fields of nested dataclasses as plain data, without None, which TOML lacks."""
+    stated = asdict(settings, dict_factory=lambda items: {k: v for k, v in items if v is not None})
+    return plain_data(stated)

@@ -91,10 +91,10 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
     (30, 0.1)
     """
     folder = datasets_directory()
+    known = sorted(p.stem for p in folder.glob("*.json"))
+    if name not in known:
+        raise DataError(f"there is no data set {name!r}; there are {choices(known, name)}")
     sidecar_file = folder / f"{name}.json"
-    if not sidecar_file.is_file():
-        known = choices(sorted(p.stem for p in folder.glob("*.json")), name)
-        raise DataError(f"there is no data set {name!r}; there are {known}")
     sidecar: dict[str, Any] = json.loads(sidecar_file.read_text(encoding="utf-8"))
     file = folder / sidecar["file"]
     content = file.read_bytes() if file.is_file() else b""

@@ -375,7 +375,11 @@ def refuse_repeated(sources: Sequence[Any]) -> None:
     seen: set[Path] = set()
     for source in sources:
         if isinstance(source, (str, Path)):
-            if (resolved := Path(source).resolve()) in seen:
+            try:
+                resolved = Path(source).resolve()
+            except ValueError as exc:
+                raise DataError(f"{source!r} is not the name of a file: {exc}") from exc
+            if resolved in seen:
                 raise DataError(f"{source}: the file is named twice; expected each file once")
             seen.add(resolved)
 
@@ -387,7 +391,7 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
     name = Path(str(path)).name if not is_frame(path) else "the table"
     try:
         match = re.search(expression, name)
-    except re.error as exc:
+    except (re.error, TypeError) as exc:
         raise DataError(
             f"level_from_name {expression!r} is not a regular expression: {exc}"
         ) from exc
