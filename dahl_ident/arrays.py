@@ -23,6 +23,9 @@ TINY = float(np.finfo(np.float64).tiny)
 NORMAL_MEDIAN = 0.6745
 """Median of a normal variable's absolute value, in standard deviations."""
 
+LARGEST_COUNT = 2**53
+"""Up to here floats hold every whole number; arrays of as many numbers exceed any memory."""
+
 SMALLEST, LARGEST = 1e-90, 1e90
 """Allowed magnitudes: squares, products and ratios of such numbers remain representable."""
 
@@ -140,10 +143,12 @@ def _one(array: FloatArray, name: str) -> float:
     return float(array)
 
 
-def whole_number(value: Any, name: str, minimum: int) -> int:
-    """Return `value` as an int >= `minimum`; a float or a bool is refused."""
+def whole_number(value: Any, name: str, minimum: int, maximum: float = LARGEST_COUNT) -> int:
+    """Return `value` as an int from `minimum` to `maximum`; a float or a bool is refused."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
         raise ValidationError(f"{name} is {value!r}; expected a whole number >= {minimum}")
+    if value > maximum:
+        raise ValidationError(f"{name} is {value!r}; expected a whole number <= {maximum}")
     return int(value)
 
 

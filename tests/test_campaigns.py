@@ -18,7 +18,7 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident import population
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, ValidationError
 from tests.campaign_cases import Changed, as_toml, assert_equal, definition, make_tables, results
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals and pipes are POSIX")
@@ -139,7 +139,11 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "law": ({"model": [{"kind": "dal"}]}, "^the campaign: .*did you mean 'dahl'"),
     "laws' path": ({"laws": "\0"}, "^the campaign: .*: the file of laws cannot be read: embedded"),
     "folder's path": ({"output__folder": "\0"}, "the folder cannot be made: embedded null"),
-    "value": ({"model": [{"kind": "dahl", "f_max": "abc"}]}, "f_max: expected real .* got 'abc'"),
+    "value": (
+        {"model": [{"kind": "mass"}, {"kind": "dahl", "f_max": "abc"}]},
+        r"^the campaign: model\[1\]: f_max: expected real .* got 'abc'",
+    ),
+    "label of a law": ({"model": [{"kind": "dahl", "fmax": 1}]}, r"model\[0\]: .* mean 'f_max'"),
 }
 
 
@@ -149,6 +153,12 @@ def test_a_wrong_definition_is_named_before_anything_runs(tmp_path, changes, mes
     with pytest.raises(DataError, match=message):
         di.campaign(definition(tmp_path, **changes), jobs=1)
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("source", [3, None, b"campaign.toml", ["campaign.toml"]])
+def test_what_is_not_a_definition_is_refused(source):
+    with pytest.raises(ValidationError, match=r"the campaign is .*; expected its path, as text"):
+        di.campaign(source)
 
 
 def test_a_column_map_is_beside_the_campaign_and_its_changes_are_named(tmp_path, monkeypatch):
@@ -280,6 +290,17 @@ def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path):
         table = di.campaign(definition(tmp_path), executor=pool).table
     assert table["status"].tolist() == ["failed", "trusted"]
     assert "died" in table["error"].iloc[0]
+
+
+def test_a_fit_of_files_that_it_can_read_makes_no_folder(tmp_path, monkeypatch):
+    """A process that was killed would leave it behind."""
+    make_tables(tmp_path, 1)
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    monkeypatch.syspath_prepend(str(tmp_path))  # no process of another test does the fit
+    (tmp_path / "temporary").mkdir()
+    before = (tmp_path / "temporary").stat().st_mtime_ns
+    assert di.campaign(definition(tmp_path), jobs=1).statuses == {"trusted": 1}
+    assert (tmp_path / "temporary").stat().st_mtime_ns == before
 
 
 # Limits of a fit

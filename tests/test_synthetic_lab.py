@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response
-from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.errors import DahlIdentError, DataError, ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 from dahl_ident.synthetic import (
     Acquisition,
@@ -143,7 +143,18 @@ def test_a_bad_description_names_the_key(data, message):
         ("run.yaml", None, r"expected an experiment in \.toml or \.json"),
         ("a.toml", "plant = [", "the experiment is not TOML"),
         ("a.json", "{", "the experiment is not JSON"),
+        ("d.json", "[" * 100_000, "the experiment is not JSON: maximum recursion depth"),
+        (
+            "e.json",
+            json.dumps(description(table={"harmonics": [10**30]})),
+            f"the experiment: table: harmonics is {10**30}; expected a whole number <= {2**53}",
+        ),
         ("b.json", json.dumps(description(plant=[{"kind": "gear"}])), ".*kind 'gear'"),
+        (
+            "c.json",
+            json.dumps(description(plant=[{"kind": "mass", "mass": 1}, {"kind": "mass", "m": 1}])),
+            r"plant\[1\]: the mass element has the keys m; expected mass",
+        ),
     ],
 )
 def test_unreadable_files_are_named(tmp_path, name, text, message):
@@ -151,6 +162,21 @@ def test_unreadable_files_are_named(tmp_path, name, text, message):
         (tmp_path / name).write_text(text)
     with pytest.raises(DataError, match=f"{name}: {message}"):
         Experiment.read(tmp_path / name)
+
+
+@pytest.mark.parametrize("read", [Experiment.read, Experiment.from_json, Experiment.from_toml])
+def test_what_is_not_a_path_or_a_text_is_refused(read):
+    with pytest.raises(DahlIdentError, match=r"the experiment is (3; expected its path|not )"):
+        read(3)
+
+
+def test_more_samples_than_any_memory_holds_are_refused():
+    for periods in (10**30, 10**400):
+        with pytest.raises(ValidationError, match=f"settling_periods is {periods}; expected a wh"):
+            replace(STEPS, settling_periods=periods)
+    with pytest.raises(ValidationError, match="the number of samples is 64000"):
+        made(FRICTION, FrequencySweep(0.1, 1.0, 10.0, 1e80, controlled="displacement"))
+    assert made(FRICTION, STEPS, seed=10**30).displacement.size  # a seed may be any whole number
 
 
 def test_impossible_experiments_are_refused():

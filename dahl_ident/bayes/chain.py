@@ -68,7 +68,7 @@ class ChainSettings:
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         object.__setattr__(self, "walkers", walkers)
-        object.__setattr__(self, "seed", whole_number(seed, "seed", 0))
+        object.__setattr__(self, "seed", whole_number(seed, "seed", 0, np.inf))
         if self.steps is not None:
             whole_number(self.steps, "steps", _LEAST_STEPS)
         whole_number(self.max_steps, "max_steps", _LEAST_STEPS)

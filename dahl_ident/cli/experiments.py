@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -320,7 +321,7 @@ def simulate(
     from dahl_ident.synthetic import simulate as run
 
     laws.run()
-    whole_number(seed, "seed", 0)
+    whole_number(seed, "seed", 0, math.inf)
     writing.check([output], [] if experiment is None else [experiment], json=general.json)
     if experiment is None:
         definition = _experiment(plant, excitation, errors)

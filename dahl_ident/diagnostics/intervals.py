@@ -393,7 +393,8 @@ def _replicate(optimum: Optimum, replicates: int | None, seed: int) -> FloatArra
         )
     if optimum.status is Status.NOT_CONVERGED or not np.isfinite(optimum.scale):
         raise FitError("there is no optimum to simulate repetitions from")
-    theta, error = repetitions(optimum, count, np.random.default_rng(whole_number(seed, "seed", 0)))
+    random = np.random.default_rng(whole_number(seed, "seed", 0, np.inf))
+    theta, error = repetitions(optimum, count, random)
     known = np.isfinite(theta) & np.isfinite(error) & (error > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(known, (theta - optimum.theta) / error, np.nan)

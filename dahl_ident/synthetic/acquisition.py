@@ -203,7 +203,7 @@ class Acquisition:
         Raises
         ------
         ValidationError
-            If the rate is not above two samples per period.
+            If the rate is not above two samples per period, or there are too many samples.
         """
         rate = self.sample_rate_hz if self.sample_rate_hz is not None else 64.0 * highest_hz
         if rate <= 2.0 * highest_hz:
@@ -211,7 +211,8 @@ class Acquisition:
                 f"sample_rate_hz is {rate:g}; expected more than {2.0 * highest_hz:g}, two samples "
                 "in the shortest period"
             )
-        return np.arange(int(np.floor(duration * rate * (1.0 + 1e-12))) + 1) / rate
+        last = int(np.floor(duration * rate * (1.0 + 1e-12)))
+        return np.arange(whole_number(last + 1, "the number of samples", 1)) / rate
 
     def record(
         self, displacement: Signal, force: Signal, time: FloatArray, draws: Draws

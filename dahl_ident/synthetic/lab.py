@@ -72,7 +72,7 @@ def simulate(
             f"experiment is a {type(experiment).__name__}; expected a dahl_ident.synthetic."
             "Experiment, such as Experiment.read('run.toml')"
         )
-    draws = Draws(whole_number(seed, "seed", 0))
+    draws = Draws(whole_number(seed, "seed", 0, np.inf))
     provenance: dict[str, Any] = {
         "generator": GENERATOR,
         "seed": int(seed),
@@ -88,13 +88,13 @@ def simulate(
         )
     waveform = excitation.waveform(seed)
     provenance["windows"] = [list(window) for window in waveform.windows]
+    times = acquisition.sampling_times(waveform.duration, waveform.highest_frequency_hz)
     displacement: Signal = waveform.value
     force: Signal = waveform.value
     if excitation.controlled == "force":
         displacement = displacement_under(experiment.plant, waveform, progress)
     else:
         force = force_under(experiment.plant, waveform, progress)
-    times = acquisition.sampling_times(waveform.duration, waveform.highest_frequency_hz)
     time, x, F = acquisition.record(displacement, force, times, draws)
     return Record(time, displacement=x, force=F, motion=experiment.motion, provenance=provenance)
 
