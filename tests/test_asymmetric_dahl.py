@@ -3,6 +3,7 @@
 import mpmath
 import numpy as np
 import pytest
+from scipy.special import i1e
 
 from dahl_ident import Dahl, Friction, Model
 from dahl_ident.errors import ValidationError
@@ -90,3 +91,32 @@ def test_derivatives_against_high_precision(k):
     )
     size = abs(exactly(f_max, sigma, a, A, 1))
     assert np.all(np.abs(slopes - expected) * np.abs(point) < 1e-8 * size)
+
+
+def in_full_slip(p):
+    """Return N at (f_max, sigma, asymmetry, amplitude) for exp(-sigma A/f_max) = 0, alpha = 1."""
+    f_max, sigma, a, A = p
+    beta = sigma * A / f_max
+    real = np.pi * (i1e(beta / (1.0 + a)) + i1e(beta / (1.0 - a)))
+    return 2.0 * f_max / (np.pi * A) * (real + 2j * (1.0 - 1.0 / beta))
+
+
+def test_derivatives_far_in_full_slip():
+    law = Model(Dahl(1.0, 3.0, asymmetry=0.2)).with_free(["f_max", "sigma", "alpha", "asymmetry"])
+    A = 0.1 / 30.0 * np.geomspace(1e3, 1e12, 28)
+    values = [np.asarray(v) for v in (0.1, 30.0, 1.0, 0.2)]
+    found = law.stiffness_gradient(values, A, AT_REST)
+    slopes = np.array([*found.by_parameter[:2], found.by_parameter[3], found.by_amplitude])
+    for i, amplitude in enumerate(A):
+        point = np.array([0.1, 30.0, 0.2, amplitude])
+        N = in_full_slip(point)
+        assert abs(found.value[i] - N) < 1e-9 * abs(N)
+        expected = central_differences(in_full_slip, point, 1e-5 * point)
+        assert np.all(np.abs(slopes[:, i] - expected) * point < 1e-7 * abs(N))
+
+
+@pytest.mark.parametrize("alpha", [0.8, 0.9, 0.99, 1.01, 1.1])
+def test_full_slip_is_coulomb_friction_for_any_exponent(alpha):
+    beta = np.geomspace(1e6, 1e12, 13)
+    N = Dahl(1.0, 1.0, alpha, asymmetry=0.2).describing_function(beta)
+    assert np.all(np.abs(beta * N - 4j / np.pi) < 4.0 / np.sqrt(beta))

@@ -27,6 +27,7 @@ from dahl_ident.engine.loop_step import (
     last_step,
     pass_switch,
     passed_before,
+    reached_zero,
     slope_fades,
     solve_stages,
 )
@@ -157,6 +158,7 @@ def _half_cycle(f, F, gap, last_pass, first, at):
                 for j in range(STAGES):
                     growth += h * MATRIX[STAGES - 1, j] * at.slopes[j]
                 at.S[0] *= np.exp(growth) if growth < _EXPANDS else 0.0
+            event = event if event >= 0 else reached_zero(at)
             for j in range(STAGES):
                 at.last[j] = at.stages[j]
             F += at.stages[STAGES - 1]

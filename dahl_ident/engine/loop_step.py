@@ -227,6 +227,18 @@ def first_event(f, psi, h, F, gap, at):
 
 
 @compiled
+def reached_zero(at):
+    """Return a switching function that has come to zero at the step's end to stay, or -1.
+
+    Otherwise rounding would choose the branch of the later steps, and their slopes.
+    """
+    for e in range(at.k if at.sines[STAGES - 1] > NEAR else 0):
+        if at.functions[STAGES - 1, e] * at.w[6 + e] <= 0.0 < at.before[e] * at.w[6 + e]:
+            return e
+    return -1
+
+
+@compiled
 def slope_fades(at):
     """Return whether the slope decreases with a switching function by more than a step resolves.
 
