@@ -322,6 +322,32 @@ class TestPlan:
         assert plan.expected["f_max"].after < 0.2
         assert ((plan.search.forecast.knowledge.values[:, 0] / 100.0) ** 2 < 200.0).all()
 
+    @pytest.mark.parametrize("A", [[5e-3], [1e-3, 3e-3, 6e-3, 2e-2]])  # too few for errors, enough
+    def test_ranges_and_earlier_data_are_combined_as_in_bayes_theorem(self, A):
+        N = di.Dahl(F_MAX, SIGMA).describing_function(A)
+        errors = 0.02 * np.array([0.4 + 0.9j, -0.9 - 0.3j, 0.5 - 0.6j, 0.3 + 0.8j])
+        response = N * np.exp(errors[: len(A)])
+        variance = (0.02 * np.abs(N)) ** 2
+        covariance = variance[:, None, None] * np.eye(2)
+        data = FrequencyResponse(np.ones(len(A)), response, A, covariance=covariance)
+        fit = di.fit(data, LINEAR, throw=False)
+        assert (fit.errors is None) == (len(A) == 1)
+        ranges = {"f_max": (1.03 * F_MAX, 1.13 * F_MAX), "sigma": (0.84 * SIGMA, 0.94 * SIGMA)}
+        plan = planned(fit, time=20, ranges=ranges, noise=None, draws=400, candidates=20)
+        drawn = plan.search.forecast.knowledge.theta
+        axes = [np.log(value) + np.linspace(-0.3, 0.3, 201) for value in (F_MAX, SIGMA)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        low, high = np.log(list(ranges.values())).T
+        cost = np.sum(((points - 0.5 * (low + high)) / (high - low) * 2.0 * 1.96) ** 2, axis=1)
+        f_max, sigma = np.exp(points.T)[..., None]
+        predicted = sigma * di.Dahl(1.0, 1.0).describing_function(sigma * A / f_max)
+        cost += np.sum(np.abs(predicted - response) ** 2 / variance, axis=1)
+        weights = np.exp(0.5 * (cost.min() - cost))
+        mean = np.average(points, axis=0, weights=weights)
+        std = np.sqrt(np.average((points - mean) ** 2, axis=0, weights=weights))
+        assert drawn.mean(axis=0) == pytest.approx(mean, abs=0.25 * std.min())
+        assert drawn.std(axis=0) == pytest.approx(std, rel=0.15)
+
     def test_every_limit_is_kept_and_the_one_that_prevents_is_named(self):
         limits = {"displacement": (1e-4 * X_C, 1e-3 * X_C), "frequency_hz": (1, 5)}
         plan = planned(time=600, limits=limits)

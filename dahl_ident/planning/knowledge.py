@@ -184,10 +184,12 @@ def _of_table(
         kept = [i for i, name in enumerate(errors.names) if name in names]
         parameters, part = tuple(wider.parameters[i] for i in kept), np.ix_(kept, kept)
         information = np.linalg.inv(errors.covariance)[part]
-        ranges_of = _among(parameters, problem.names, 1.0 / std**2, 0.0)
-        covariance = np.linalg.inv(np.linalg.inv(errors.covariance[part]) + np.diag(ranges_of))
-        change = _among(parameters, problem.names, centre, 0.0) - errors.theta[kept]
-        at = errors.theta[kept] + covariance @ (ranges_of * change)
+        at, covariance = _with_ranges(
+            errors.theta[kept],
+            np.linalg.inv(errors.covariance[part]),
+            _among(parameters, problem.names, centre, 0.0),
+            _among(parameters, problem.names, 1.0 / std**2, 0.0),
+        )
         theta = _drawn(rng, at, covariance, draws, parameters)
         stated, cycles = _row_noise(wider, 0.0)
         noise = float(np.hypot(stated, errors.rms(NOISE)))
@@ -201,7 +203,8 @@ def _of_table(
         if values is None:
             at = np.where(finite, theta, centre)
             scale: Any = optimum.scale if np.isfinite(optimum.scale) else 1.0
-            covariance = np.linalg.inv(problem.information(at, scale) + np.diag(1.0 / std**2))
+            of_data = problem.information(at, scale)
+            at, covariance = _with_ranges(at, of_data, centre, 1.0 / std**2)
             theta = _drawn(rng, at, covariance, draws, problem.parameters)
         else:
             P = len(problem.names)
@@ -317,6 +320,14 @@ def _of_records(
         motion=problem.records[0].motion,
         sample_noise=float(np.std(np.concatenate(fit.residuals))),
     )
+
+
+def _with_ranges(
+    theta: FloatArray, information: Any, centre: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance of a normal estimate together with normal ranges."""
+    covariance: FloatArray = np.linalg.inv(information + np.diag(precision))
+    return theta + covariance @ (precision * (centre - theta)), covariance
 
 
 def _drawn(
