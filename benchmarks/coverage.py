@@ -160,7 +160,7 @@ def tally(
 def _count(
     result: Tally, scenario: Scenario, optimum: Optimum, bootstrap: bool, replicates: int, seed: int
 ) -> None:
-    profile = profile_intervals(optimum)
+    profile = profile_intervals(Profiler(optimum))
     kinds = {"wald": wald_intervals(optimum), "profile": profile}
     if bootstrap:
         kinds["bootstrap"] = bootstrap_intervals(optimum, LEVELS[:2], replicates, seed)

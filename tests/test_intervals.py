@@ -10,12 +10,32 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, special, stats
 
-from dahl_ident import BoucWen, Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
+from dahl_ident import (
+    BoucWen,
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    Sensors,
+    Spring,
+    fit,
+    load_dataset,
+    response,
+)
 from dahl_ident.diagnostics import identifiability
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status
 from dahl_ident.results import FitResult
-from tests.friction_tables import X_C, amplitudes, plant_table, stated, table
+from tests.friction_tables import (
+    FRICTION,
+    X_C,
+    amplitudes,
+    driven,
+    plant_table,
+    relative_noise,
+    stated,
+    table,
+)
 
 
 def spring_table(n=8, seed=3):
@@ -344,8 +364,8 @@ class TestOneInterval:
             name: p.value for name, p in found.params.items()
         }
         predicted = found.predict(1.0, amplitude=A), found.describing_function(A)
-        for response in (found.best_fit, *(band.response for band in predicted)):
-            np.testing.assert_allclose(response, law.describing_function(A), rtol=1e-9)
+        for values in (found.best_fit, *(band.response for band in predicted)):
+            np.testing.assert_allclose(values, law.describing_function(A), rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["alpha_2", "outliers"])
@@ -399,6 +419,18 @@ def test_profiles_are_searched_only_where_noise_leaves_a_parameter_vague():
     p = found.params["p"]  # not a logarithm: its error counts over its size
     assert 1.0 < p.stderr < 0.1 * abs(p.value)
     assert [one.method for one in found.assessment.computed_intervals(0.9545)] == ["combined"]
+
+
+def test_profiles_do_not_depend_on_what_was_asked_for_before():
+    """Profiles by exact steady motions are searched for the parameters that are asked for."""
+    known, f, u = Mass(0.3) + Spring(8.0), np.full(4, 0.4), np.geomspace(0.05, 0.1, 4)
+    R = response(FRICTION + known + Damper(1.0), f, u).receptance * relative_noise(4, 0.06, 1)
+    model = Dahl(alpha=1.0) + known + Damper()
+    first, second = (fit(driven(f, R, u, 0.06), model, throw=False) for _ in range(2))
+    first.conf_interval(levels=0.6827)
+    late, early = (one.conf_interval("profile", 0.6827) for one in (first, second))
+    np.testing.assert_allclose(late.lower, early.lower, rtol=1e-6)
+    np.testing.assert_allclose(late.upper, early.upper, rtol=1e-6)
 
 
 def test_repetitions_are_calibrated_again():

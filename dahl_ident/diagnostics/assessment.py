@@ -31,6 +31,7 @@ from dahl_ident.diagnostics.intervals import (
     wald_intervals,
 )
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
+from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DahlIdentError, FitError, ValidationError, choices
@@ -134,6 +135,11 @@ class Assessment(ABC):
     def by_noise(self) -> Optimum:
         """The optimum with the covariance of noise alone."""
 
+    @cached_property
+    def profiler(self) -> Profiler:
+        """The profiles, from noise alone."""
+        return Profiler(self.by_noise)
+
     @abstractmethod
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
@@ -206,8 +212,9 @@ class Assessment(ABC):
             return self.combined_intervals(levels)
         if method == "bootstrap":
             return bootstrap_intervals(self.by_noise, levels, replicates, seed)
-        quick = wald_intervals if method == "wald" else profile_intervals
-        return quick(self.by_noise, levels)
+        if method == "wald":
+            return wald_intervals(self.by_noise, levels)
+        return profile_intervals(self.profiler, levels)
 
 
 class TableAssessment(Assessment):
@@ -312,7 +319,10 @@ class TableAssessment(Assessment):
         if errors is None:
             return replace(self.intervals("profile", levels), method="combined")
         return combined_intervals(
-            self.optimum, errors, levels, lambda: self.intervals("profile", levels)
+            self.optimum,
+            errors,
+            levels,
+            lambda doubtful: profile_intervals(self.profiler, levels, doubtful),
         )
 
     @cached_property

@@ -31,7 +31,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.arrays import BoolArray, FloatArray, whole_number
 from dahl_ident.diagnostics.confidence_levels import (
     LEVELS,
     MANY,
@@ -148,18 +148,23 @@ def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> Confid
     )
 
 
-def profile_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
-    """Return where the profile of the deviance meets the thresholds; open where it does not."""
+def profile_intervals(
+    profiler: Profiler, levels: Sequence[float] = LEVELS, asked: BoolArray | None = None
+) -> ConfidenceIntervals:
+    """Return where the profile of the deviance meets the thresholds; open where it does not.
+
+    If the search is slow, limits are NaN for parameters that were not `asked` for, by default all.
+    """
     array = checked_levels(levels)
-    lower, upper = Profiler(optimum).limits(thresholds(optimum, array))
-    return intervals_from_search(optimum, "profile", array, lower, upper)
+    lower, upper = profiler.limits(thresholds(profiler.optimum, array), asked)
+    return intervals_from_search(profiler.optimum, "profile", array, lower, upper)
 
 
 def combined_intervals(
     optimum: Optimum,
     errors: ErrorModel,
     levels: Sequence[float],
-    profile: Callable[[], ConfidenceIntervals],
+    profile: Callable[[BoolArray], ConfidenceIntervals],
 ) -> ConfidenceIntervals:
     """Return intervals that count every source of error: value -+ k u.
 
@@ -186,7 +191,7 @@ def combined_intervals(
     by_noise = np.sqrt(np.diagonal(noise.covariance))
     doubtful = ~determined | ~(by_noise <= LARGE * natural_sizes(noise))
     if doubtful.any():
-        shape = profile()
+        shape = profile(doubtful)
         values = np.where(determined, values, shape.estimate)
         # where one side is open, u says nothing about the other: its limit is that of the profile,
         # moved away from the estimate by the other sources

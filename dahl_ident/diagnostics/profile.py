@@ -137,40 +137,60 @@ class Profiler:
     """Profiles of every free parameter of one optimum."""
 
     def __init__(self, optimum: Optimum) -> None:
-        self._optimum, self._problem = optimum, optimum.problem
+        self.optimum, self._problem = optimum, optimum.problem
         self._searched = self._problem.near(optimum.theta)
         self._scale = 1.0 if optimum.scale_known else optimum.scale
         self._loss = loss_named(optimum.loss, self._problem.residuals_per_row)
         self._logarithmic = self._problem.space.positive
         self._low, self._high = self._problem.bounds()
+        self._is_slow = False  # whether each step takes exact steady motions
+        self._limits: dict[bytes, FloatArray] = {}  # of thresholds
 
     # Limits
 
-    def limits(self, thresholds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def limits(
+        self, thresholds: FloatArray, asked: BoolArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return lower and upper limits in search coordinates, each of shape (levels, P).
 
-        `thresholds` are roots of the deviance. Minus and plus infinity where a side is open.
+        `thresholds` are roots of the deviance. Minus and plus infinity where a side is open. If the
+        search is slow, limits are NaN for parameters that were not `asked` for, (P,), by default
+        all.
         """
-        P, L = self._problem.n_reported, len(thresholds)
-        ends = np.stack([np.full((L, P), -np.inf), np.full((L, P), np.inf)])
-        side, level, index = (a.ravel() for a in np.indices((2, L, P)))
+        unknown = np.full((2, len(thresholds), self._problem.n_reported), np.nan)
+        ends = self._limits.setdefault(thresholds.tobytes(), unknown)
+        new = np.isnan(ends[0, 0])
+        if self._is_slow and asked is not None:
+            new &= asked
+        if new.any():
+            limits = self._new_limits(thresholds, np.flatnonzero(new))
+            if self._searched is not self._problem and not self._agrees(limits):
+                self._searched, self._is_slow = self._problem, True
+                del self._at_optimum
+                return self.limits(thresholds, asked)
+            ends[..., new] = limits
+        return ends[0], ends[1]
+
+    def _new_limits(self, thresholds: FloatArray, asked: IntArray) -> FloatArray:
+        """Return both limits of some parameters, shape (2, levels, asked)."""
+        ends = np.full((2, len(thresholds), asked.size), np.inf)
+        ends[0] = -np.inf
+        side, level, column = (a.ravel() for a in np.indices(ends.shape))
+        index = asked[column]
         is_open = self._open[side, index]
         known = bool(np.isfinite(self._scale) and np.isfinite(thresholds).all())
         if known and self._problem.response is None:  # of records
-            far = np.zeros((2, L, P), dtype=np.bool_)
-            positive = np.flatnonzero(self._logarithmic[:P])
-            far[..., positive] = self.far_deviance(positive)[:, None] < thresholds[:, None] ** 2
+            far = np.zeros(ends.shape, dtype=np.bool_)
+            positive = self._logarithmic[asked]
+            far_deviance = self.far_deviance(asked[positive])
+            far[..., positive] = far_deviance[:, None] < thresholds[:, None] ** 2
             is_open = is_open | far.ravel()
         search = np.flatnonzero(~is_open)
         if known and search.size:
-            ends[side[search], level[search], index[search]] = self._ends(
+            ends[side[search], level[search], column[search]] = self._ends(
                 index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
             )
-            if self._searched is not self._problem and not self._agrees(ends):
-                self._searched = self._problem
-                del self._at_optimum
-                return self.limits(thresholds)
-        return ends[0], ends[1]
+        return ends
 
     def _agrees(self, ends: FloatArray) -> bool:
         """Return whether the exact steady motion has the same deviance at the widest limits.
@@ -180,10 +200,10 @@ class Profiler:
         widest = ends[:, np.argmax(ends[1].max(axis=1))]
         limit, index = widest.ravel(), np.tile(np.arange(widest.shape[1]), 2)
         closed = np.isfinite(limit)
-        index, moved = index[closed], (limit - self._optimum.theta[index])[closed]
+        index, moved = index[closed], (limit - self.optimum.theta[index])[closed]
         if not index.size:
             return True
-        theta = self._optimum.theta + moved[:, None] * self._tangents[index]
+        theta = self.optimum.theta + moved[:, None] * self._tangents[index]
         near, exact = (
             p.quadratic(theta, self._scale, self._loss).cost
             for p in (self._searched, self._problem)
@@ -194,8 +214,8 @@ class Profiler:
 
     def _ends(self, index: IntArray, sign: FloatArray, target: FloatArray) -> FloatArray:
         """Return where the profile of parameter `index` meets `target` on the side of `sign`."""
-        theta = np.tile(self._optimum.theta, (len(index), 1))
-        tangent, origin = self._tangents[index], self._optimum.theta[index]
+        theta = np.tile(self.optimum.theta, (len(index), 1))
+        tangent, origin = self._tangents[index], self.optimum.theta[index]
         was_reachable = np.zeros(len(index), dtype=np.bool_)
         furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
         step, width = self._first_step[index] * target, _NARROW * self._conditional[index]
@@ -235,7 +255,7 @@ class Profiler:
     @cached_property
     def _edges(self) -> list[FloatArray]:
         """Starts in gross slip, where data with a free spring do not rule out microslip."""
-        sd, starts = np.sqrt(np.diagonal(self._optimum.covariance)), []
+        sd, starts = np.sqrt(np.diagonal(self.optimum.covariance)), []
         for chart in self._microslip_charts:
             f_max, sigma = _friction_of(chart)
             if max(sd[f_max], sd[sigma]) > DOUBTFUL:
@@ -260,7 +280,7 @@ class Profiler:
         which first states and offsets, which are nearly interchangeable, follow. They are few, so
         the deviance may be too large, but is not too small.
         """
-        theta = np.tile(self._optimum.theta, (2, index.size, 1))
+        theta = np.tile(self.optimum.theta, (2, index.size, 1))
         theta[:, np.arange(index.size), index] += np.array([[-_FAR], [_FAR]])
         rows, held = theta.reshape(-1, theta.shape[-1]), np.tile(index, 2)
         least = np.full(len(rows), np.inf)
@@ -277,9 +297,9 @@ class Profiler:
 
     def curve(self, index: int, coordinate: FloatArray) -> FloatArray:
         """Return the deviance of parameter `index` at each of `coordinate`."""
-        distance = coordinate - self._optimum.theta[index]
+        distance = coordinate - self.optimum.theta[index]
         order = np.argsort(np.abs(distance))
-        deviance, last = np.empty(len(coordinate)), np.tile(self._optimum.theta, (2, 1))
+        deviance, last = np.empty(len(coordinate)), np.tile(self.optimum.theta, (2, 1))
         for block in np.array_split(order, max(1, order.size // _POINTS_AT_ONCE)):
             side = (distance[block] > 0.0).astype(np.intp)
             start = last[side]
@@ -337,17 +357,17 @@ class Profiler:
 
     @cached_property
     def _least_cost(self) -> float:
-        return self._optimum.cost / self._scale**2
+        return self.optimum.cost / self._scale**2
 
     @cached_property
     def _at_optimum(self) -> Quadratic:
-        theta = self._optimum.theta[None]
+        theta = self.optimum.theta[None]
         cost, gradient, hessian = self._searched.quadratic(theta, self._scale, self._loss)
         return Quadratic(cost[0], gradient[0], hessian[0])
 
     @cached_property
     def _tangents(self) -> FloatArray:
-        P = len(self._optimum.theta)
+        P = len(self.optimum.theta)
         hessian = np.broadcast_to(self._at_optimum.hessian, (P, P, P))
         return _tangent(hessian, np.arange(P))
 
@@ -359,10 +379,10 @@ class Profiler:
         """
         in_time = self._problem.response is None
         if self._loss is None and not in_time:
-            return np.ones(len(self._optimum.theta))
+            return np.ones(len(self.optimum.theta))
         expected = np.diagonal(inverse(self._at_optimum.hessian)[0])
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = expected / np.diagonal(self._optimum.covariance)
+            ratio = expected / np.diagonal(self.optimum.covariance)
         valid = np.isfinite(ratio) & (ratio > 0.0)
         if in_time:
             return np.where(valid, ratio, 1.0)
@@ -379,7 +399,7 @@ class Profiler:
     @cached_property
     def _first_step(self) -> FloatArray:
         """Return the first step for a threshold of 1: a standard error, of logarithms at most 1."""
-        error = np.sqrt(np.diagonal(self._optimum.covariance))
+        error = np.sqrt(np.diagonal(self.optimum.covariance))
         unknown = np.where(self._logarithmic, 1.0, self._conditional)
         step = np.where(np.isfinite(error) & (error > 0.0), error, unknown)
         step = np.where(np.isfinite(step) & (step > 0.0), step, 1.0)
@@ -392,8 +412,8 @@ class Profiler:
         These are the sides on which the optimum lies at infinity or zero, and those of parameters
         that can change without any change of the prediction.
         """
-        values, status = self._optimum.values, self._optimum.status
-        flat = np.isinf(np.diagonal(self._optimum.covariance)) & (status is Status.SINGULAR)
+        values, status = self.optimum.values, self.optimum.status
+        flat = np.isinf(np.diagonal(self.optimum.covariance)) & (status is Status.SINGULAR)
         flat |= status is Status.NOT_CONVERGED
         below = (values == -np.inf) | (self._logarithmic & (values == 0.0))
         return np.array([below | flat, (values == np.inf) | flat])
@@ -446,7 +466,7 @@ class Profiler:
         """Distance from the optimum beyond which a search gives up."""
         pure = np.array([p.unit == "" for p in self._problem.parameters])
         logarithms = np.where(pure, _FARTHEST_RATIO, _FARTHEST_LOG)
-        far = _FARTHEST_LINEAR * self._conditional + 2.0 * np.abs(self._optimum.theta)
+        far = _FARTHEST_LINEAR * self._conditional + 2.0 * np.abs(self.optimum.theta)
         return np.where(self._logarithmic, logarithms, far)
 
 

@@ -20,7 +20,6 @@ from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Friction, UniversalCurve
 from dahl_ident.errors import ValidationError
-from dahl_ident.fitting import Optimum
 from dahl_ident.plots.style import new_axes
 from dahl_ident.reporting.document import Picture
 from dahl_ident.reporting.provenance import parts, sources
@@ -218,7 +217,7 @@ def _profiles(fit: FitResult) -> Picture:
         grid = new_axes(rows, 2, size=(4.8, 1.9 * rows), sharex=False)
         for index, axis in enumerate(grid.flat):
             if index < fit.nvarys:
-                _draw_profile(optimum, index, axis)
+                _draw_profile(fit.assessment.profiler, index, axis)
             else:
                 axis.set_axis_off()
         return grid
@@ -232,10 +231,10 @@ def _profiles(fit: FitResult) -> Picture:
     )
 
 
-def _draw_profile(optimum: Optimum, index: int, axis: plots.Axes) -> None:
+def _draw_profile(profiler: Profiler, index: int, axis: plots.Axes) -> None:
     """Draw a profile out to its widest limit, or over three decades if that is open."""
+    optimum = profiler.optimum
     name, parameter = optimum.names[index], optimum.problem.parameters[index]
-    profiler = Profiler(optimum)
     q = thresholds(optimum, np.array(LEVELS))
     best = float(optimum.theta[index])
     reach = np.log(1e3) if parameter.positive else abs(best) + 1.0
