@@ -59,6 +59,22 @@ class TestBands:
         low, high = band.phase(0.95)
         np.testing.assert_allclose(high - low, 2.0 * t * band.phase_std)
 
+    def test_scatter_between_levels_has_their_degrees_of_freedom(self):
+        """One-way analysis of variance: the mean of L levels, gain and phase, has 2 (L - 1)."""
+        rng, L, n = np.random.default_rng(1), 6, 3
+        error = rng.normal(0.0, 0.05, (L, 1, 2)) + rng.normal(0.0, 0.01, (L, n, 2))
+        response = (1000.0 + 300.0j) * np.exp(error.reshape(-1, 2) @ [1.0, 1.0j])
+        A = np.repeat(np.geomspace(1e-4, 1e-2, L), n)
+        linear = fit(
+            di.FrequencyResponse(np.full(L * n, 10.0), response, A), di.Spring() + di.Damper()
+        )
+        between = np.sum((error.mean(axis=1) - error.mean(axis=(0, 1))) ** 2) / (2 * (L - 1))
+        band = linear.predict(10.0, amplitude=1e-3, noise=False)
+        assert band.log_gain_std == pytest.approx(np.sqrt(between / L), rel=1e-6)
+        low, high = band.gain(0.95)
+        t = np.log(high / low) / (2.0 * band.log_gain_std)
+        assert t == pytest.approx(special.stdtrit(2 * (L - 1), 0.975), rel=1e-6)
+
     def test_cover_the_true_curve(self):
         truth = di.Dahl(0.1, 30.0).describing_function(GRID)
         inside = []

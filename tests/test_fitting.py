@@ -8,7 +8,7 @@ from typing import Any
 import lmfit
 import numpy as np
 import pytest
-from scipy import optimize, stats
+from scipy import integrate, optimize, stats
 
 from dahl_ident import (
     Dahl,
@@ -176,6 +176,21 @@ def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(loss, factor,
     error = np.sqrt(np.diagonal(expected.covariance))
     assert np.all(np.abs(found.theta - expected.theta) < 0.01 * error)
     assert found.scale == pytest.approx(expected.scale, rel=1e-3)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_likelihood_of_a_robust_fit_is_that_of_its_density(loss):
+    measured = MEASURED * np.where(np.arange(n) == 3, 1.5, 1.0)
+    found = fit(table(measured, covariance=COVARIANCE), Dahl(alpha=1.0), loss=loss, throw=False)
+    predicted = Dahl(*found.optimum.values).describing_function(A)
+    error = np.stack([(measured - predicted).real, (measured - predicted).imag], axis=-1)
+    z = np.einsum("ni,nij,nj->n", error, np.linalg.inv(COVARIANCE), error)
+    area, _ = integrate.quad(
+        lambda r: 2.0 * np.pi * r * np.exp(-0.5 * LOSSES[loss](r * r)), 0.0, np.inf
+    )
+    size = 0.5 * np.linalg.slogdet(COVARIANCE)[1]
+    expected = np.sum(-0.5 * LOSSES[loss](z) - np.log(area) - size)
+    assert found.log_likelihood == pytest.approx(expected, abs=1e-8)
 
 
 @pytest.mark.parametrize(

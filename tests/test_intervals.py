@@ -290,6 +290,15 @@ class TestTable:
         assert "sigma" not in {name for name, _ in flagged}
         assert "by wald and open by profile; trust the latter" in str(compared)
 
+    def test_limits_disagree_from_a_fifth_of_the_half_width(self):
+        result = fit(table(beta=(0.01, 0.03), n=12), Dahl(alpha=1.0))
+        compared = result.compare_intervals(["wald", "profile"], levels=0.95)
+        (wald, profile), value = compared.intervals, result.params["f_max"].value
+        limits = ((wald.lower, profile.lower), (wald.upper, profile.upper))
+        lower, upper = (abs(np.log(w / p) / np.log(p / value))[0, 0] for w, p in limits)
+        assert 0.18 < lower < 0.2 < upper < 0.22
+        assert [(d.name, d.side) for d in compared.disagreements] == [("f_max", "upper")]
+
     def test_mapping_and_frame(self):
         found = self.result().conf_interval()
         assert list(found) == ["f_max", "sigma", "alpha"]

@@ -54,6 +54,20 @@ def test_the_force_over_time_is_that_of_the_sliders():
         np.testing.assert_allclose(LAW.force(x, float(start.sum())), expected, atol=1e-11)
 
 
+def test_no_spring_of_a_record_begins_beyond_its_slip():
+    """Both springs slip at the first sample, so noise would put their loads on either side of 1."""
+    t = np.arange(0.0, 2.0, 0.005)
+    x = 3e-3 * (np.sin(2.0 * np.pi * t) + 0.3 * np.sin(7.0 * t))
+    stiffness, slip = np.array([30.0, 10.0]), np.array([7e-4, 3e-3])
+    force = jenkins_force(x, stiffness, slip, stiffness * slip)
+    for seed in range(2):
+        noise = np.random.default_rng(seed).normal(0.0, 2e-3, t.size)
+        record = di.Record(t, displacement=x, force=force + noise)
+        found = fit(record, di.MaxwellSlip(2), throw=False)
+        loads = [found.params[f"initial_load_{i}"].value for i in (1, 2)]
+        assert 0.9 < min(loads) <= max(loads) <= 1.0
+
+
 def test_facts_and_refusals():
     values = [np.asarray(v) for v in (*STIFF, *SLIPS)]
     assert [float(v) for v in LAW.force_limits(values)] == pytest.approx([1.9, 1.9])

@@ -353,8 +353,8 @@ def test_what_the_model_misses_from_place_to_place_is_in_the_budget():
     assert steady.trusted
 
 
-def test_a_fit_that_is_stopped_keeps_what_it_found(monkeypatch, capsys):
-    record = recorded(DAHL, "random", 500, 1e-3)
+def stopped(monkeypatch, record, **start):
+    """Return what a fit has found that is stopped at its ninth prediction."""
     own, calls = RecordProblem.predict, []
 
     def predict(self, *given, **how):
@@ -366,14 +366,24 @@ def test_a_fit_that_is_stopped_keeps_what_it_found(monkeypatch, capsys):
     monkeypatch.setattr(RecordProblem, "predict", predict)
     monkeypatch.setattr("dahl_ident.progress.PATIENCE", 0.0)
     with pytest.raises(KeyboardInterrupt) as stop:
-        di.fit(record, di.Dahl(), progress=True, start={"f_max": 0.2, "sigma": 10.0})
+        di.fit(record, di.Dahl(), progress=True, start=start)
     monkeypatch.undo()
     assert isinstance(stop.value, FitInterrupted)
-    so_far = stop.value.result
+    return stop.value.result
+
+
+def test_a_fit_that_is_stopped_keeps_what_it_found(monkeypatch, capsys):
+    so_far = stopped(monkeypatch, recorded(DAHL, "random", 500, 1e-3), f_max=0.2, sigma=10.0)
     assert not so_far.success
     assert so_far.status.value == "not described"
     assert 0.09 < so_far.params["f_max"].value < 0.19
     assert capsys.readouterr().out == ""
+
+
+def test_a_long_record_whose_part_was_searched_is_judged_as_a_whole(monkeypatch):
+    so_far = stopped(monkeypatch, recorded(DAHL, "random", 20000, 1e-3), f_max=0.2)
+    assert [len(part) for part in so_far.residuals] == [20000]
+    assert 0.09 < so_far.params["f_max"].value < 0.19
 
 
 def test_parts_that_are_left_out_are_predicted():

@@ -122,6 +122,14 @@ class TestTrust:
         assert tested.status.value == "not described"  # there is no friction
         assert "does not describe these data" in tested.verdict
 
+    def test_harmonics_test_the_model_at_one_amplitude(self):
+        """Two parameters, and four numbers of the fundamental and the third harmonic."""
+        k, law = np.tile([1, 3], 6), Dahl(0.1, 30.0)
+        exact = np.array([complex(law.dynamic_stiffness(5e-3, harmonic=order)) for order in k])
+        response = exact * relative_noise(12, 0.01, 1)
+        data = FrequencyResponse(np.ones(12), response, np.full(12, 5e-3), harmonic=k)
+        assert fit(data, Dahl(alpha=1.0), throw=False).goodness.judged
+
     def test_a_law_that_another_one_replaces_is_not_described(self):
         """Of two Jenkins elements one slips at every level: sigma would be half the truth."""
         A = np.geomspace(1.0, 20.0, 8) * X_C
