@@ -14,6 +14,7 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -194,6 +195,19 @@ def test_long_names_of_sources_are_not_cut_off():
     sources = "scatter between runs", "force calibration", "noise", "exponent"
     rows = [("force_gain", source, 0.2) for source in (*sources, "scatter between repeated levels")]
     the_figure(plots.plot_budget(rows))
+
+
+def test_the_legends_of_plans_and_devices_hide_no_data():
+    time = np.array([100.0, 1000.0])
+    curves = dict.fromkeys(("f_max", "sigma", "alpha"), (time, 1.0 / time, 2.0 / time))
+    own = np.array([0.05, 0.10, 0.11])
+    devices = {"own": own, "shrunken": own, "u": 0.1 * own, "outlying": own < 0.1}
+    for axis in (
+        plots.plot_bench_time(curves),
+        plots.plot_devices(pd.DataFrame(devices), 0.1, label="f_max [N]"),
+    ):
+        the_figure(axis)
+        assert axis.get_legend().get_window_extent().y0 >= axis.bbox.y1
 
 
 @same_picture

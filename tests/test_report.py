@@ -210,6 +210,9 @@ def test_the_page_in_chromium(page_file, tmp_path):
             broken = "[...document.images].filter(i => !i.complete || !i.naturalWidth).length"
             assert page.value(broken) == 0
             assert page.screenshot().startswith(b"\x89PNG")
+        page.open(page_file, 1000)
+        first = "document.querySelector('.scroll')"
+        assert page.value(f"{first}.scrollWidth") == page.value(f"{first}.clientWidth")
         _check_sorting(page)
         _check_copying(page)
         _check_contrast(page)

@@ -344,7 +344,7 @@ def plot_bench_time(
         ylabel="relative uncertainty [%]",
     )
     style.readable_log_ticks(axis)
-    axis.legend()
+    style.legend_above(axis)
     return axis
 
 
@@ -386,7 +386,7 @@ def plot_devices(devices: pd.DataFrame, mean: float, *, label: str, ax: Axes | N
     else:
         axis.set_xlabel(f"{len(table)} devices in the order of their own estimate")
     axis.set_ylabel(label)
-    axis.legend(loc="upper left")
+    style.legend_above(axis)
     return axis
 
 

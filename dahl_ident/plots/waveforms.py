@@ -93,7 +93,7 @@ def plot_sample_residuals(
     residuals: ArrayLike,
     *,
     x_label: str = "time [s]",
-    channel: str = "force",
+    channel: str = "force [N]",
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the residuals of a record's samples, with their root mean square as title.
@@ -104,19 +104,20 @@ def plot_sample_residuals(
         Time or displacement, and measured minus fitted samples.
     x_label : str
         Axis label with unit.
-    channel : str, default "force"
-        The fitted channel.
+    channel : str, default "force [N]"
+        The fitted channel with its unit.
 
     Examples
     --------
     >>> plot_sample_residuals([0.0, 1.0], [3.0, -3.0]).get_title("left")
-    '3 rms'
+    '3 N rms'
     """
     axis = style.axes(ax, size=(6.4, 3.0))
     axis.plot(x, residuals, color=style.BLUE, lw=0.6)
     axis.axhline(0.0, color="0.5", lw=0.6)
     axis.set(xlabel=x_label, ylabel=f"measured minus fitted {channel}")
-    axis.set_title(f"{np.sqrt(np.mean(np.square(residuals))):.3g} rms")
+    unit = channel.partition("[")[2].removesuffix("]")
+    axis.set_title(f"{np.sqrt(np.mean(np.square(residuals))):.3g} {unit} rms")
     return axis
 
 
