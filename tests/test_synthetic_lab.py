@@ -176,6 +176,9 @@ def test_more_samples_than_any_memory_holds_are_refused():
             replace(STEPS, settling_periods=periods)
     with pytest.raises(ValidationError, match="the number of samples is 64000"):
         made(FRICTION, FrequencySweep(0.1, 1.0, 10.0, 1e80, controlled="displacement"))
+    late = Channel(delay=1e20, antialias_hz=50.0)
+    with pytest.raises(ValidationError, match="the number of filtered samples is"):
+        made(FRICTION, STEPS, Acquisition(1000.0, late))
     assert made(FRICTION, STEPS, seed=10**30).displacement.size  # a seed may be any whole number
 
 

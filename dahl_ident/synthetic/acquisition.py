@@ -136,6 +136,8 @@ class Channel:
         if self.antialias_hz is None:
             return signal
         first = start - abs(self.delay) - step
+        span = stop + abs(self.delay) - first
+        whole_number(int(_FILTER_OVERSAMPLING * span / step), "the number of filtered samples", 1)
         grid = np.arange(first, stop + abs(self.delay) + 2.0 * step, step / _FILTER_OVERSAMPLING)
         y = signal(grid)
         d = 2.0 * np.pi * self.antialias_hz * (grid[1] - grid[0])
