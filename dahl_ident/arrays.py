@@ -137,6 +137,11 @@ def finite_number(value: Any, name: str) -> float:
     return _one(finite_array(value, name), name)
 
 
+def real_number(value: Any, name: str) -> float:
+    """Return `value` as one float, which may be NaN or infinite."""
+    return _one(real_array(value, name), name)
+
+
 def _one(array: FloatArray, name: str) -> float:
     if array.ndim:
         raise ValidationError(f"{name}: expected one number, got an array of shape {array.shape}")

@@ -9,7 +9,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident import simulate
 from dahl_ident.elements import KINDS, describe_model, model_from_description
-from dahl_ident.errors import ModelError
+from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.synthetic import SteppedSine
 from tests.derivatives import central_differences
 from tests.test_generic_friction import Jenkins
@@ -134,6 +134,17 @@ def test_a_function_has_no_description():
         ),
         ({"kind": "mass", "m": 1.0}, "the mass element has the keys m; expected mass"),
         ({"kind": "mass", "mass": {"strat": 1.0}}, "mass has the key 'strat'; .* mean 'start'"),
+        *(
+            ({"kind": "dahl", "f_max": f_max}, rf"^model\[0\]: {message}")
+            for f_max, message in (
+                ({"lower": "0.1"}, "lower of f_max: expected real numbers, got '0.1'"),
+                ({"upper": 10**400}, "upper of f_max: expected real numbers, got 1000"),
+                ({"lower": 2.0, "upper": 1.0}, "f_max has the bounds 2 and 1; expected the lower"),
+                ({"free": False, "start": 0.1}, "free of f_max is False; expected true, or a num"),
+                ({"assumed": 0.1, "upper": 1.0}, "f_max has the key 'upper'; .* with assumed"),
+            )
+        ),
+        ({"kind": "dahl", "name": True}, "name is True; expected letters, digits and underscores"),
         (
             {"kind": "linear_system", "quantity": "receptance"},
             r"model\[0\]: the linear_system element has the keys quantity; expected quantity",
@@ -151,7 +162,7 @@ def test_a_function_has_no_description():
     ],
 )
 def test_bad_descriptions_name_what_is_wrong(entry, message):
-    with pytest.raises(ModelError, match=message):
+    with pytest.raises((ModelError, ValidationError), match=message):
         model_from_description([entry])
 
 

@@ -342,11 +342,11 @@ class ForceLaw(ABC):
         return None
 
 
-def prefixed(name: str | None, label: str) -> str:
+def prefixed(name: object, label: str) -> str:
     """Return the full name of the parameter `label` of an element called `name`."""
     if name is None:
         return label
-    if not str(name).isidentifier():
+    if not (isinstance(name, str) and name.isidentifier()):
         raise ValidationError(
             f"name is {name!r}; expected letters, digits and underscores, such as 'pivot'"
         )

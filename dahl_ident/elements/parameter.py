@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dahl_ident.arrays import LARGEST, SMALLEST, finite_number, positive_number
+from dahl_ident.arrays import LARGEST, SMALLEST, finite_number, positive_number, real_number
 from dahl_ident.errors import ModelError, ValidationError, choices
 
-_DESCRIPTION = ("free", "start", "lower", "upper", "assumed")  # keys of a described parameter
+_FREE, _ASSUMED = ("free", "start", "lower", "upper"), ("assumed",)  # keys of what is described
 
 Dimension = tuple[int, int, int]
 """Powers of force, displacement and time in a unit."""
@@ -173,20 +173,34 @@ class Parameter:
             return replace(self, value=None, free=True, assumed=False)
         if not isinstance(description, Mapping):
             return self.fixed(description)
-        for key in sorted(description.keys() - _DESCRIPTION)[:1]:
+        known = _ASSUMED if "assumed" in description else _FREE
+        for key in sorted(description.keys() - known)[:1]:
             raise ModelError(
                 f"{self.name} has the key {key!r}; expected a number, 'free', or a table with "
-                f"{choices(_DESCRIPTION, key)}"
+                f"{choices(known, key)}"
             )
         if "assumed" in description:
             return replace(self, value=description["assumed"], free=False, assumed=True)
+        if description.get("free", True) is not True:
+            raise ModelError(
+                f"free of {self.name} is {description['free']!r}; expected true, or a number in "
+                "place of the table"
+            )
+        lower, upper = (
+            real_number(description.get(key, getattr(self, key)), f"{key} of {self.name}")
+            for key in ("lower", "upper")
+        )
+        if not lower < upper:
+            raise ModelError(
+                f"{self.name} has the bounds {lower:g} and {upper:g}; expected the lower one first"
+            )
         return replace(
             self,
             value=description.get("start"),
             free=True,
             assumed=False,
-            lower=description.get("lower", self.lower),
-            upper=description.get("upper", self.upper),
+            lower=lower,
+            upper=upper,
         )
 
     def freed(self) -> Parameter:
