@@ -127,6 +127,8 @@ def test_options_come_from_a_file_and_the_command_line_wins(run):
             "no command is called fti; there are app, campaign, datasets, ",
         ),
         ("fti = 3\n", "no command has the option fti; "),
+        ("fit = 3\n", "no command has the option fit; "),
+        ("[sample]\npriro = 3\n", "sample has no option priro; there are "),
     ],
 )
 def test_an_unknown_name_in_a_file_of_options_is_refused(run, options, says):

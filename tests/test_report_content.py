@@ -116,6 +116,7 @@ def test_metadata_from_a_file(fit, tmp_path):
     [
         ({"speciman": "x"}, r"field 'speciman'; expected any of title, number, lab"),
         ({"operator": ["x"]}, r"operator is \['x'\]; expected a text"),
+        ({"ambient": False}, "ambient is False; expected a text, a number or a date"),
         ({"instruments": "x"}, "instruments is 'x'; expected a list"),
         ({"instruments": [{"nmae": "x"}]}, r"instruments\[0\] has the field 'nmae'"),
     ],

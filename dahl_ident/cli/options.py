@@ -40,16 +40,21 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
     except (ValueError, RecursionError) as exc:
         raise DataError(f"{path} is not a TOML file of options: {exc}") from exc
     command = ctx.info_name or ""
-    tables = {k: v for k, v in content.items() if isinstance(v, dict)}
+    tables = {
+        name: {k.replace("-", "_"): v for k, v in options.items()}
+        for name, options in content.items()
+        if isinstance(options, dict)
+    }
     shared = {k.replace("-", "_"): v for k, v in content.items() if k not in tables}
-    specific = {k.replace("-", "_"): v for k, v in tables.get(command, {}).items()}
     every: Mapping[str, Any] = getattr(ctx.find_root().command, "commands", {})
     commands = {name: {p.name for p in c.params} - {"config"} for name, c in every.items()}
+    common = {p.name for c in every.values() for p in c.params if p.param_type_name == "option"}
     known = commands.get(command, set())
     _refuse_unknown(path, "no command is called", tables, commands.keys())
-    _refuse_unknown(path, f"{command} has no option", specific, known)
-    _refuse_unknown(path, "no command has the option", shared, set().union(*commands.values()))
-    chosen = {k: v for k, v in shared.items() if k in known} | specific
+    for name, options in tables.items():
+        _refuse_unknown(path, f"{name} has no option", options, commands[name])
+    _refuse_unknown(path, "no command has the option", shared, common - {"config"})
+    chosen = {k: v for k, v in shared.items() if k in known} | tables.get(command, {})
     parameters = ctx.command.params
     several = {p.name for p in parameters if getattr(p, "multiple", False) or p.nargs != 1}
     ctx.default_map = {k: _typed(v, several=k in several) for k, v in chosen.items()}

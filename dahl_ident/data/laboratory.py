@@ -119,7 +119,7 @@ def metadata_of(source: Mapping[str, Any] | str | Path | None) -> Metadata:
     name = f"{where}ambient"
     if isinstance(ambient, Mapping):  # such as {temperature = "22 °C"}
         ambient = [f"{key} {_text(item, f'{name}.{key}')}" for key, item in ambient.items()]
-    elif ambient:
+    elif ambient not in ((), ""):
         ambient = [_text(ambient, name)]
     if not isinstance(instruments, (list, tuple)):
         raise ValidationError(
