@@ -516,6 +516,9 @@ class TestManyFiles:
             ({"level_from_name": "_([0-9.]+)V", "drive": "1 N"}, "finds no group in the name"),
             ({"level_from_name": "_[0-9.]+N", "drive": "1 N"}, "put the level in round"),
             ({"level_from_name": "(", "drive": "1 N"}, "is not a regular expression"),
+            ({"drive": 3}, "drive is 3; expected text"),
+            ({"level": [], "drive": "1 N"}, r"level is \[\]; expected a text or a number"),
+            ({"frequency_hz": [3], "drive": "1 N"}, r"frequency_hz is \[3\]; expected \(low, high"),
             ({"level_from_name": 3}, "level_from_name 3 is not a regular expression"),
             ({"drive": "{level} N"}, "level_from_name gives nothing"),
             ({"drive": "5 um"}, r"drive has the unit \[um\]"),
@@ -524,7 +527,7 @@ class TestManyFiles:
     )
     def test_refusal(self, tmp_path, options, message):
         path = exported(tmp_path, "beam_0.2N.csv", 0.2)
-        with pytest.raises((DataError, UnitError), match=message):
+        with pytest.raises((DataError, UnitError, ValidationError), match=message):
             read_frequency_response([path], **options)
 
     def test_files_that_do_not_go_together(self, tmp_path):

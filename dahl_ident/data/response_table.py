@@ -10,12 +10,13 @@ import fnmatch
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_number
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_number, real_array
 from dahl_ident.data.column_map import Binding, ColumnMap, by_level, column_map_of, proposal
 from dahl_ident.data.columns import CONTROLLED, RECORD_COLUMNS, RESPONSE_COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
@@ -67,6 +68,13 @@ class ResponseOptions:
     run: str | None = None
     frequency_hz: tuple[float, float] | None = None
     passive: bool = True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.level, str | Real | None):
+            raise ValidationError(f"level is {self.level!r}; expected a text or a number")
+        limits = self.frequency_hz
+        if limits is not None and real_array(limits, "frequency_hz").shape != (2,):
+            raise ValidationError(f"frequency_hz is {limits!r}; expected (low, high)")
 
 
 def response_from(

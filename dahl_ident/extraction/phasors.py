@@ -14,6 +14,7 @@ denominator is called the reference here, the other one the output.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -21,7 +22,14 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtri
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray, positive_number, whole_number
+from dahl_ident.arrays import (
+    TINY,
+    ComplexArray,
+    FloatArray,
+    finite_number,
+    positive_number,
+    whole_number,
+)
 from dahl_ident.data.columns import CONTROLLED, one_of, set_checked
 from dahl_ident.data.plausibility import creates_energy
 from dahl_ident.errors import ValidationError
@@ -80,6 +88,8 @@ class Settings:
         set_checked(self, partial(whole_number, minimum=FEWEST_CYCLES), "num_periods")
         set_checked(self, partial(whole_number, minimum=0), "settling_periods")
         set_checked(self, positive_number, "frequency")
+        if not isinstance(self.harmonics, Iterable):
+            raise ValidationError(f"harmonics is {self.harmonics!r}; expected several numbers")
         orders = tuple(whole_number(k, "harmonics", 0) for k in self.harmonics)
         if not orders or max(orders) > HARMONICS or len(set(orders)) < len(orders):
             raise ValidationError(
@@ -88,6 +98,7 @@ class Settings:
             )
         object.__setattr__(self, "harmonics", orders)
         one_of(self.controlled, "controlled", CONTROLLED)
+        set_checked(self, finite_number, "min_share")
         if not 0.0 <= self.min_share < 1.0:
             raise ValidationError(
                 f"min_share is {self.min_share!r}; expected a share from 0 to below 1"

@@ -168,6 +168,8 @@ def extract(
         del options[name]
     reading = {} if columns is None else {"columns": columns}
     named = _named(records)
+    if reading and any(isinstance(record, Record) for _, record in named):
+        raise ValidationError("columns is given for a record; expected it where the file is read")
     if isinstance(records, Mapping):
         return extract_all([FileTask(r, name, level, reading) for name, r in named], options, jobs)
     tasks = [FileTask(source, None, level, reading) for _, source in named]

@@ -149,10 +149,10 @@ def read_frequency_response(
         groups = groups_in_name(one, level_from_name)
         options = ResponseOptions(
             frequency=frequency,
-            amplitude=_filled(amplitude, groups, one),
-            drive=_filled(drive, groups, one),
+            amplitude=_filled("amplitude", amplitude, groups, one),
+            drive=_filled("drive", drive, groups, one),
             level=groups.get("level", level),
-            run=_filled(run, groups, one),
+            run=_filled("run", run, groups, one),
             frequency_hz=frequency_hz,
             passive=passive,
         )
@@ -408,8 +408,12 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
         return groups | {"level": level}
 
 
-def _filled(text: str | None, groups: Mapping[str, Any], path: PathLike | pd.DataFrame) -> Any:
+def _filled(
+    name: str, text: str | None, groups: Mapping[str, Any], path: PathLike | pd.DataFrame
+) -> Any:
     """Return a text with its braces filled; not by str.format, which would reach attributes."""
+    if not isinstance(text, str | None):
+        raise ValidationError(f"{name} is {text!r}; expected text")
     parts = re.split(r"\{(\w+)\}", text or "")
     absent = [name for name in parts[1::2] if name not in groups]
     if absent or any(mark in part for part in parts[0::2] for mark in "{}"):
