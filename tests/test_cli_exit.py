@@ -228,7 +228,9 @@ def test_a_place_that_cannot_be_is_refused_before_any_work(run, command):
         "file.json/new.json": "file.json/new.json: there is no folder file.json; make it",
         "folder.json": "folder.json is a folder; give the path of a file in it",
     }.items():
-        assert run.refused(*command.format(place).split()).startswith(f"error: {says}")
+        words = command.format(place).split()
+        for overwrite in ([], ["--overwrite"]):
+            assert run.refused(*words, *overwrite).startswith(f"error: {says}")
     assert sorted(p.name for p in Path().iterdir()) == ["file.json", "folder.json", "levels.csv"]
 
 

@@ -464,6 +464,7 @@ def test_any_record_gives_points_or_a_named_error(
     [
         ({"mode": "chirp"}, "mode is 'chirp'; expected one of auto, steps, sweep"),
         ({"frequency": -1.0}, "frequency is -1.0; expected numbers > 0"),
+        ({"frequency": 1e39}, r"the number of cycles is \d{39,}; expected a whole number <= "),
         ({"num_periods": 1}, "num_periods is 1"),
         ({"settling_periods": -1}, "settling_periods is -1"),
         ({"harmonics": (1, 11)}, r"harmonics is \[1, 11\]; expected different numbers from 0 to 9"),

@@ -259,8 +259,7 @@ class Writing:
                 raise ValidationError(
                     f"{place} is an input and would be overwritten; give the output another name"
                 )
-            if not self.overwrite:
-                refuse_existing(place)
+            refuse_existing(place, overwrite=self.overwrite)
             if not place.parent.is_dir():
                 raise DataError(
                     f"{place}: there is no folder {place.parent}; make it, or give another place"

@@ -105,11 +105,11 @@ def parsed(loads: Callable[[str], Any], text: str, otherwise: str) -> Any:
         raise DataError(f"{otherwise}: {exc}") from exc
 
 
-def refuse_existing(path: Path) -> None:
-    """Refuse to replace a file."""
+def refuse_existing(path: Path, *, overwrite: bool = False) -> None:
+    """Refuse to replace a folder, or without `overwrite` a file."""
     if path.is_dir():
         raise DataError(f"{path} is a folder; give the path of a file in it")
-    if path.exists():
+    if path.exists() and not overwrite:
         raise DataError(
             f"{path}: the file exists already; give another name, or replace it with "
             f"{argument('overwrite', True)}"
@@ -127,8 +127,7 @@ def make_folder(folder: Path, *, parents: bool = True) -> None:
 
 def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
     """Write a file completely, or not at all."""
-    if not overwrite:
-        refuse_existing(path)
+    refuse_existing(path, overwrite=overwrite)
     try:
         put_in_place(path, lambda part: part.write_bytes(content), overwrite=overwrite)
     except FileExistsError:  # another process has written it meanwhile

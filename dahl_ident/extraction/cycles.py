@@ -22,7 +22,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import TINY, BoolArray, ComplexArray, FloatArray, IntArray
+from dahl_ident.arrays import (
+    TINY,
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    whole_number,
+)
 
 _THRESHOLD = 0.3  # fraction of the amplitude that half a cycle exceeds; noise may be a tenth
 _QUANTILES = (0.995, 0.9, 0.7)  # that give the amplitude, tried in turn: a few peaks may be large
@@ -149,7 +156,8 @@ def find_cycles(
 
 def _cut(time: FloatArray, motion: FloatArray, frequency_hz: float, periods: int) -> Cycles:
     interval = float(np.median(np.diff(time)))
-    count = int((time[-1] - time[0] + 1.5 * interval) * frequency_hz / periods)
+    cycles = (time[-1] - time[0] + 1.5 * interval) * frequency_hz / periods
+    count = whole_number(int(cycles), "the number of cycles", 0)
     edges = time[0] - 0.5 * interval + np.arange(count + 1) * periods / frequency_hz
     return _measured(time, motion, edges, periods)
 

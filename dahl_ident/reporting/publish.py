@@ -95,8 +95,7 @@ def report(
     'report.json'
     """
     place = place_of(path, "a report", FORMATS)
-    if not overwrite:
-        refuse_existing(place)
+    refuse_existing(place, overwrite=overwrite)
     listed = list(results) if isinstance(results, Sequence) else [results]
     stated = metadata_of(metadata)
     _check(listed)
@@ -172,9 +171,8 @@ def content_of(whole: Document, kind: str) -> bytes:
 
 def _write_pictures(whole: Document, folder: Path, overwrite: bool) -> None:
     places = {folder / f"{picture.name}.png": picture for picture in whole.pictures}
-    if not overwrite:
-        for place in places:
-            refuse_existing(place)
+    for place in places:
+        refuse_existing(place, overwrite=overwrite)
     make_folder(folder, parents=False)
     for place, picture in places.items():
         write_whole(place, picture.rendered("png"), overwrite=overwrite)
