@@ -339,6 +339,19 @@ class TestOneInterval:
         few = table(beta=(0.3, 3.0), n=4, noise=0.1, seed=4)
         return fit(few, Dahl(), throw=False)
 
+    def test_a_limit_counts_every_source_where_the_other_side_is_open(self):
+        data = table(beta=(1e-3, 1e-2), n=40, noise=0.01, seed=2)
+        found = fit(replace(data, covariance=stated(data.response, 0.01)), Dahl())
+        noise, every = (
+            found.conf_interval(method, levels=0.9545)["f_max"][0]
+            for method in ("profile", "combined")
+        )
+        row = found.budget()["f_max"]
+        (exponent,) = (part.u / row.value for part in row.rows if part.source == "exponent")
+        distance = np.hypot(np.log(row.value / noise.lower), row.k * exponent)
+        assert every.lower == pytest.approx(row.value * np.exp(-distance), rel=1e-3)
+        assert every.upper == noise.upper == np.inf
+
     @pytest.mark.parametrize("case", ["described", "misfit", "few and noisy"])
     def test_of_every_parameter(self, case):
         found = self.fitted(case)

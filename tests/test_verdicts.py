@@ -255,7 +255,19 @@ def test_a_prior_that_the_data_contradict_is_named():
     data = replace(data, response=1.1 * data.response)
     against = fit(data, Dahl(f_max=0.1), sensors=Sensors(force_gain=stats.norm(1.0, 0.01)))
     assert "The data contradict the prior of force_gain: 1.0" in against.verdict
+    off = (against.optimum.values[-1] - 1.0) / 0.01
+    assert f"{off:.1f} standard deviations" in against.verdict
     assert not against.trusted
+
+
+def test_bands_need_not_cover_a_force_in_parallel_on_which_they_are_centred():
+    """A weak damper that the model does not have: held-out rows are predicted all the same."""
+    f, A = np.repeat(np.geomspace(1.0, 20.0, 6), 6), np.tile(np.geomspace(5e-4, 2e-2, 6), 6)
+    exact = (Dahl(0.1, 30.0) + Damper(0.0025)).dynamic_stiffness(A, 2.0 * np.pi * f)
+    data = FrequencyResponse(f, exact * relative_noise(36, 0.002, 1), A)
+    codes = {finding.code for finding in fit(data, Dahl(alpha=1.0), throw=False).findings}
+    assert {"misfit", "held_out"} <= codes
+    assert "narrow_bands" not in codes
 
 
 def test_a_free_delay_states_the_gain_that_it_assumes():
