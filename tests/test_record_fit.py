@@ -353,6 +353,15 @@ def test_what_the_model_misses_from_place_to_place_is_in_the_budget():
     assert steady.trusted
 
 
+def test_springs_in_parallel_have_no_limits_of_their_own():
+    record = recorded(DAHL + di.Spring(20.0), "random", 500, 1e-3)
+    fit = di.fit(record, di.Dahl(alpha=1.0) + di.Spring() + di.Spring(name="other"), throw=False)
+    assert fit.status.value == "not determined"
+    assert fit.params["stiffness"].stderr == fit.params["other_stiffness"].stderr == np.inf
+    total = fit.params["stiffness"].value + fit.params["other_stiffness"].value
+    assert total == pytest.approx(20.0, abs=5.0 * fit.params["sigma"].stderr)
+
+
 def stopped(monkeypatch, record, **start):
     """Return what a fit has found that is stopped at its ninth prediction."""
     own, calls = RecordProblem.predict, []
