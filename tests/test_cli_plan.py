@@ -85,6 +85,7 @@ def test_a_target_out_of_reach_ends_with_3(run):
         ((*RANGES, "--target", "f_max=a"), "f_max is 'a'; expected a number"),
         ((*RANGES, "--target", "f_max=1", "--target", "sigma"), "with and without a number"),
         ((*RANGES, "--waveform", "w.csv"), "--waveform and --motion need --sample-rate"),
+        ((*RANGES, "--seed", "-1"), "seed is -1; expected a whole number >= 0"),
         (("nothing.json", "--mass", "1"), "a saved fit has its model and sensors"),
     ],
 )

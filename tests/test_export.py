@@ -232,6 +232,9 @@ def test_draws_follow_the_fit_and_the_posterior(tmp_path):
     drawn = str(posterior.export("draws", size=5, seed=2)).splitlines()
     assert drawn[0].startswith("f_max [N],sigma [N/m]")
     assert len(drawn) == 6
+    for result in (fit, posterior):
+        with pytest.raises(ValidationError, match="seed is -1; expected a whole number >= 0"):
+            result.export("draws", size=5, seed=-1)
     with pytest.raises(ValidationError, match="exported as 'draws' alone"):
         posterior.export("c")
 

@@ -158,6 +158,7 @@ def plan(
     (True, True)
     """
     whole_number(draws, "draws", 2)
+    whole_number(seed, "seed", 0, np.inf)
     one_of(controlled, "controlled", CONTROLLED)
     bench = BenchLimits.of(limits)
     knowledge = gather(source, ranges, draws, seed)

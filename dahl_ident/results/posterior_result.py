@@ -279,7 +279,8 @@ class Posterior(Result):
 
     def _drawn(self, size: int, seed: int) -> FloatArray:
         """Return the coordinates of draws."""
-        return self.sample.draws.drawn(whole_number(size, "size", 1), seed)
+        count, seed = whole_number(size, "size", 1), whole_number(seed, "seed", 0, np.inf)
+        return self.sample.draws.drawn(count, seed)
 
     def to_frame(self) -> pd.DataFrame:
         """Return all draws, with a column for each parameter; for a grid also ``weight``."""

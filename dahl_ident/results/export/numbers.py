@@ -105,7 +105,7 @@ def draws(result: Any, size: int, seed: int, path: str | Path | None) -> bytes:
     """
     import pandas as pd
 
-    count = whole_number(size, "size", 1)
+    count, seed = whole_number(size, "size", 1), whole_number(seed, "seed", 0, np.inf)
     if hasattr(result, "draws"):
         table = dict(zip(result.names, result.draws(count, seed).T, strict=True))
         table = {name: table[name] for name in result.params if name in table}
