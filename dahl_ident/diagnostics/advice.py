@@ -155,15 +155,14 @@ def record_advice(
 
     `model` has the estimates put in.
     """
-    places = {p.name: i for i, p in enumerate(problem.free)}
     paths = [stretches(r.displacement) for r in problem.records if r.displacement is not None]
     why = {}
     for element in model.elements:
         for parameter in (p for p in element.parameters if p.name in lost):
-            i = places[parameter.name]
+            i = errors.names.index(parameter.name)
             known = float(errors.covariance[i, i]) ** 0.5 < abs(float(parameter.value or 0))
             missing = _missing_motion(element, paths, problem.motion, known=known)
-            why[parameter.name] = f"because {missing or _largest_source(problem, errors, i)}"
+            why[parameter.name] = f"because {missing or _largest_source(errors, i)}"
     return why
 
 
@@ -196,7 +195,7 @@ def _missing_motion(
     return ""
 
 
-def _largest_source(problem: RecordProblem, errors: RecordErrors, place: int) -> str:
+def _largest_source(errors: RecordErrors, place: int) -> str:
     """Return the largest source of uncertainty, or a parameter with a similar effect."""
     covariance = errors.covariance
     for source, C in errors.contributions.items():
@@ -205,7 +204,7 @@ def _largest_source(problem: RecordProblem, errors: RecordErrors, place: int) ->
     with np.errstate(all="ignore"):
         size = np.sqrt(covariance.diagonal())
         alike = np.abs(covariance[place] / size / size[place]) > _INDISTINGUISHABLE
-    others = [n for i, n in enumerate(problem.names) if alike[i] and i != place]
+    others = [n for i, n in enumerate(errors.names) if alike[i] and i != place]
     if others:
         return f"it cannot be distinguished from {', '.join(others)}: fix one of them"
     return "its effect is small compared with the residuals: fix it, or leave the element out"

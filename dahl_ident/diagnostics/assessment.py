@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,11 +32,12 @@ from dahl_ident.diagnostics.intervals import (
 )
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.profile import Profiler
+from dahl_ident.diagnostics.record_sources import ContradictedExponent
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DahlIdentError, FitError, ValidationError, choices
 from dahl_ident.fitting import solve
-from dahl_ident.fitting.optimum import ConstraintCost, Optimum, propagated
+from dahl_ident.fitting.optimum import ConstraintCost, Optimum
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import counted, shown_unit
 
@@ -55,16 +56,6 @@ _NOISE = {
     "relative": "relative: constant variance of (ln gain, phase)",
     "absolute": "absolute: constant variance of (real, imaginary part)",
 }
-
-
-class ContradictedExponent(NamedTuple):
-    """An assumed or stated exponent, and the different one that the data indicate."""
-
-    name: str
-    fixed: float
-    indicated: float
-    stderr: float
-    range: tuple[float, float] | None  # None where the user stated the value
 
 
 class Assessment(ABC):
@@ -269,10 +260,9 @@ class TableAssessment(Assessment):
         stderr = dict(self.optimum.stderr)
         errors = self.errors_of_combinations
         if errors is not None:
-            size = np.abs(errors.problem.value_slopes(errors.theta))
-            noise = size * np.sqrt(np.maximum(np.diagonal(errors.contributions[NOISE]), 0.0))
-            by_name = dict(zip(errors.names, noise.tolist(), strict=True))
-            stderr |= {name: by_name[name] for name in stderr if errors.holds(name)}
+            held = [name for name in stderr if errors.holds(name)]
+            variances = np.diagonal(errors.values_covariance(held, NOISE))
+            stderr |= dict(zip(held, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
         return stderr
 
     @cached_property
@@ -281,9 +271,7 @@ class TableAssessment(Assessment):
         errors = self.errors
         if errors is None:
             return self.optimum.values_covariance
-        free = [errors.names.index(name) for name in self.optimum.names]
-        covariance = propagated(errors.covariance, errors.problem.value_slopes(errors.theta))
-        return np.asarray(covariance[np.ix_(free, free)])
+        return errors.values_covariance(self.optimum.names)
 
     @property
     def estimate(self) -> Optimum:

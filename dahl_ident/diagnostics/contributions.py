@@ -7,8 +7,9 @@ Each source contributes a covariance, and the covariance of the estimate is thei
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,29 @@ CHANNELS = {
 class ErrorContributions(ABC):
     """An estimate's covariance by source of error, in the coordinates of the estimate."""
 
+    problem: Any  # the assumed exponents free; its `names` order every array here
     contributions: Mapping[str, FloatArray]  # (Q, Q) each, noise first
+    # names of parameters that were assumed: exponents, the force gain for a drive factor
+    assumed: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Free parameters and assumed exponents."""
+        return tuple(self.problem.names)
+
+    def places(self, names: Iterable[str]) -> list[int]:
+        """Return the places of parameters in `names`."""
+        return [self.names.index(name) for name in names]
+
+    @abstractmethod
+    def of_values(self, covariance: FloatArray) -> FloatArray:
+        """Return a covariance of the estimates as one of the parameters' values, (Q, Q)."""
+
+    def values_covariance(self, names: Iterable[str], source: str | None = None) -> FloatArray:
+        """Return the covariance of the values of some parameters, from one source or from all."""
+        at = self.places(names)
+        every = self.covariance if source is None else self.contributions[source]
+        return np.asarray(self.of_values(every)[np.ix_(at, at)])
 
     @cached_property
     def covariance(self) -> FloatArray:

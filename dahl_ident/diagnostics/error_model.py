@@ -71,7 +71,13 @@ from dahl_ident.diagnostics.residual_space import (
     run_deviations,
 )
 from dahl_ident.fitting import Optimum
-from dahl_ident.fitting.optimum import agreed_scale, blanked, information_of, inverse
+from dahl_ident.fitting.optimum import (
+    agreed_scale,
+    blanked,
+    information_of,
+    inverse,
+    propagated,
+)
 from dahl_ident.problem import TableProblem
 
 _FEWEST_TESTS = 5  # of which each is left out in turn
@@ -91,14 +97,12 @@ class ErrorModel(ErrorContributions):
     """The estimate, and its covariance by every source of error."""
 
     optimum: Optimum  # the least-squares fit that it started from
-    # the assumed exponents free, covariances as stated; its `names` order every array here
-    problem: TableProblem
+    problem: TableProblem  # the assumed exponents free, covariances as stated
     estimate: WeightedEstimate  # weighted least squares
     sources: tuple[Source, ...]  # random errors that rows share, those that the residuals show
     state: MixedState  # the mixed model of the residuals at the variances of noise and sources
     contributions: Mapping[str, FloatArray]  # (Q, Q): covariance of theta by source, type A first
     tests: int  # number of tests, of which each may have been left out
-    # names of parameters that were assumed: exponents, the force gain for a drive factor
     assumed: tuple[str, ...]
     # (2, count, Q, Q): covariance of theta by each variance at unit size, with the exponents
     # estimated, and with exact ones
@@ -111,10 +115,9 @@ class ErrorModel(ErrorContributions):
         """The estimate, search coordinates, (Q,)."""
         return self.estimate.theta
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Free parameters and assumed exponents."""
-        return self.problem.names
+    def of_values(self, covariance: FloatArray) -> FloatArray:
+        """Return a covariance of theta as one of the values, (Q, Q)."""
+        return propagated(covariance, self.problem.value_slopes(self.theta))
 
     @property
     def variances(self) -> FloatArray:
@@ -147,9 +150,8 @@ class ErrorModel(ErrorContributions):
     @cached_property
     def stderr(self) -> Mapping[str, float]:
         """Combined standard uncertainty of each value, by name."""
-        size = np.abs(self.problem.value_slopes(self.theta))
-        errors = size * np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
-        return dict(zip(self.names, errors.tolist(), strict=True))
+        variances = np.diagonal(self.of_values(self.covariance))
+        return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
 
     def holds(self, name: str) -> bool:
         """Return whether the data determine a parameter."""

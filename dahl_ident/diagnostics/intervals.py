@@ -40,6 +40,7 @@ from dahl_ident.diagnostics.confidence_levels import (
     level_text,
     thresholds,
 )
+from dahl_ident.diagnostics.contributions import ErrorContributions
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import degrees_text, table
 from dahl_ident.diagnostics.profile import Profiler
@@ -178,58 +179,62 @@ def combined_intervals(
     dof_of_all = np.array([errors.dof(direction) for direction in directions])
     k_of_all = coverage_factors(dof_of_all, array[:, None])
     low, high = around(every.space, estimates, u_of_all * every.space.slopes(estimates), k_of_all)
-    fitted = [errors.names.index(name) for name in optimum.names]
+    fitted = errors.places(optimum.names)
     determined = np.array([errors.holds(name) for name in optimum.names])
-    values, lower, upper = estimates[fitted], low[:, fitted], high[:, fitted]
-    u, k, dof = (
-        u_of_all[fitted],
-        k_of_all[:, fitted],
-        np.where(determined, dof_of_all[fitted], np.inf),
-    )
+    values, u, k = estimates[fitted], u_of_all[fitted], k_of_all[:, fitted]
+    dof = np.where(determined, dof_of_all[fitted], np.inf)
     positive = optimum.problem.space.positive
     noise = errors.by_noise
     by_noise = np.sqrt(np.diagonal(noise.covariance))
     doubtful = ~determined | ~(by_noise <= LARGE * natural_sizes(noise))
     if doubtful.any():
         shape = profile(doubtful)
-        values = np.where(determined, values, shape.estimate)
+        estimates[fitted] = np.where(determined, values, shape.estimate)
         # where one side is open, u says nothing about the other: its limit is that of the profile,
         # moved away from the estimate by the other sources
         unlimited = np.isinf(shape.upper) | np.isinf(shape.lower) | (positive & (shape.lower == 0))
         by_profile = doubtful & (~determined | unlimited.any(axis=0))
         beyond = np.where(determined, np.maximum(u**2 - by_noise**2, 0.0), 0.0)
-        ends = []
-        for end, sign in ((shape.lower, -1.0), (shape.upper, 1.0)):
+        for limits, end, sign in ((low, shape.lower, -1.0), (high, shape.upper, 1.0)):
             theta = search_coordinates(noise, end)
             far = np.hypot(theta - noise.theta, k * np.sqrt(beyond))
             moved = noise.problem.to_values(noise.theta + sign * far)
-            ends.append(np.where(np.isfinite(theta) & (beyond > 0.0), moved, end))
-        lower = np.where(by_profile, ends[0], lower)
-        upper = np.where(by_profile, ends[1], upper)
+            moved = np.where(np.isfinite(theta) & (beyond > 0.0), moved, end)
+            limits[:, fitted] = np.where(by_profile, moved, limits[:, fitted])
     shown = degrees_text(np.where(dof < MANY, dof, np.inf)[determined])
     law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
     note = f"every source of the budget: {law}"
-    assumed = [name for name in errors.assumed if errors.holds(name)]
-    also = [errors.names.index(name) for name in assumed]
-    ranges = {p.name: p.prior for p in optimum.problem.model.parameters if p.assumed and p.prior}
-    low, high = within_ranges(
-        low[:, also],
-        high[:, also],
-        estimates[also],
-        [ranges.get(name, (-np.inf, np.inf)) for name in assumed],
-    )
-    lower, upper = np.hstack([lower, low]), np.hstack([upper, high])
-    units = tuple(
-        p.unit for p in (*optimum.problem.parameters, *(every.parameters[i] for i in also))
-    )
+    assumed = tuple(name for name in errors.assumed if errors.holds(name))
+    return intervals_of(errors, optimum.names, assumed, array, estimates, (low, high), note)
+
+
+def intervals_of(
+    errors: ErrorContributions,
+    fitted: tuple[str, ...],
+    assumed: tuple[str, ...],
+    levels: FloatArray,
+    values: FloatArray,
+    limits: tuple[FloatArray, FloatArray],
+    note: str,
+) -> ConfidenceIntervals:
+    """Return the combined intervals of fitted and, within their ranges, of assumed parameters.
+
+    `values` are those of all estimates of `errors`, (Q,), `limits` their lower and upper limits,
+    (L, Q). An estimate beyond an end of its range keeps its limit there.
+    """
+    at = errors.places((*fitted, *assumed))
+    parameters = [errors.problem.parameters[i] for i in at]
+    ranges = [p.prior if p.name in assumed and p.prior else (-np.inf, np.inf) for p in parameters]
+    least, most = np.array(ranges).T
+    values, lower, upper = values[at], limits[0][:, at], limits[1][:, at]
     return ConfidenceIntervals(
         "combined",
-        array,
-        (*optimum.names, *assumed),
-        units,
-        np.append(values, estimates[also]),
-        lower,
-        upper,
+        levels,
+        (*fitted, *assumed),
+        tuple(p.unit for p in parameters),
+        values,
+        np.where(values > least, np.maximum(lower, least), lower),
+        np.where(values < most, np.minimum(upper, most), upper),
         note,
     )
 
@@ -264,20 +269,6 @@ def around(
         lower = np.where(by_factor, values / factor, values - k * u)
         upper = np.where(by_factor, values * factor, values + k * u)
     return np.maximum(lower, least), np.minimum(upper, most)
-
-
-def within_ranges(
-    lower: FloatArray,
-    upper: FloatArray,
-    values: FloatArray,
-    ranges: Sequence[tuple[float, float]],
-) -> tuple[FloatArray, FloatArray]:
-    """Return limits within the assumed ranges; an estimate beyond an end keeps its limit there."""
-    least, most = np.reshape(ranges, (-1, 2)).T
-    return (
-        np.where(values > least, np.maximum(lower, least), lower),
-        np.where(values < most, np.minimum(upper, most), upper),
-    )
 
 
 def intervals_from_search(

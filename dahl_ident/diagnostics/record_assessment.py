@@ -13,7 +13,7 @@ from dahl_ident.arrays import TINY, FloatArray, IntArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
 from dahl_ident.diagnostics.advice import record_advice
-from dahl_ident.diagnostics.assessment import Assessment, ContradictedExponent
+from dahl_ident.diagnostics.assessment import Assessment
 from dahl_ident.diagnostics.bands import DerivedQuantity, quantities_and_slopes
 from dahl_ident.diagnostics.budget import Budget, parameter_budget
 from dahl_ident.diagnostics.confidence_levels import (
@@ -27,7 +27,7 @@ from dahl_ident.diagnostics.confidence_levels import (
 from dahl_ident.diagnostics.contributions import ALONG_MOTION, MODEL_ERROR, NOISE, variances
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.goodness import Goodness
-from dahl_ident.diagnostics.intervals import LARGE, ConfidenceIntervals, around, within_ranges
+from dahl_ident.diagnostics.intervals import LARGE, ConfidenceIntervals, around, intervals_of
 from dahl_ident.diagnostics.misfit_explanations import force_convention
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.diagnostics.record_errors import (
@@ -35,6 +35,7 @@ from dahl_ident.diagnostics.record_errors import (
     errors_on_constraints,
     record_errors,
 )
+from dahl_ident.diagnostics.record_sources import ContradictedExponent
 from dahl_ident.diagnostics.verdicts import (
     FIRST_ORDER_UP_TO,
     IDENTIFIED_BELOW,
@@ -164,20 +165,16 @@ class RecordAssessment(Assessment):
 
     @property
     def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
-        """Estimates and combined standard uncertainties by name."""
-        names = self.optimum.names
-        u = np.sqrt(np.diagonal(self.covar)).tolist()
-        values = dict(zip(names, self.optimum.values.tolist(), strict=True))
-        stderr = dict(zip(names, u, strict=True))
-        for exponent in self.errors.assumed:
-            values[exponent.name] = exponent.value
-            stderr[exponent.name] = exponent.value * exponent.std
-        return values, stderr
+        """Estimates and combined standard uncertainties by name, assumed exponents included."""
+        errors = self.errors
+        at = errors.places((*self.optimum.names, *errors.assumed))
+        values, u = errors.values.tolist(), np.sqrt(np.diagonal(errors.covariance)).tolist()
+        return {errors.names[i]: values[i] for i in at}, {errors.names[i]: u[i] for i in at}
 
     @property
     def assumed(self) -> tuple[str, ...]:
         """Names of parameters whose values are assumed; the uncertainty counts their ranges."""
-        return tuple(exponent.name for exponent in self.errors.assumed)
+        return self.errors.assumed
 
     @property
     def success(self) -> bool:
@@ -216,22 +213,27 @@ class RecordAssessment(Assessment):
             residuals = np.split(unit * scores, ends)
         if self.first_order:
             return errors_on_constraints(self.optimum, jacobians, residuals)
-        return record_errors(self.problem, self.optimum.values, jacobians, residuals)
+        return record_errors(self.problem, self.optimum.values, residuals)
 
     @property
     def effective_samples(self) -> float:
         """Samples of white noise with the same information as the residuals."""
         return self.errors.effective
 
-    @property
+    @cached_property
     def covar(self) -> FloatArray:
         """Covariance of the free values, from all sources together."""
-        return self.errors.covariance
+        return self.errors.values_covariance(self.optimum.names)
+
+    @cached_property
+    def covar_noise(self) -> FloatArray:
+        """Covariance of the free values from the residuals' noise alone."""
+        return self.errors.values_covariance(self.optimum.names, NOISE)
 
     @property
     def stderr_noise(self) -> Mapping[str, float]:
         """Standard error of every free value from the residuals' noise alone."""
-        sizes = np.sqrt(self.errors.contributions[NOISE].diagonal()).tolist()
+        sizes = np.sqrt(self.covar_noise.diagonal()).tolist()
         return dict(zip(self.optimum.names, sizes, strict=True))
 
     @property
@@ -244,7 +246,7 @@ class RecordAssessment(Assessment):
         """The optimum with the covariance of correlated noise."""
         slopes = self.problem.value_slopes(self.optimum.theta)
         with np.errstate(divide="ignore", invalid="ignore"):
-            covariance = self.errors.contributions[NOISE] / np.outer(slopes, slopes)
+            covariance = self.covar_noise / np.outer(slopes, slopes)
         return replace(
             self.optimum,
             covariance=np.where(np.isnan(covariance), np.inf, covariance),
@@ -256,38 +258,21 @@ class RecordAssessment(Assessment):
 
         They are open where far larger or smaller values describe the records nearly as well.
         """
-        array = checked_levels(levels)
-        values = self.optimum.values
-        assumed = self.errors.assumed
-        dof = [self.errors.dof(direction) for direction in np.eye(values.size)]
+        array, errors = checked_levels(levels), self.errors
+        dof = [errors.dof(direction) for direction in np.eye(len(errors.names))]
         k = coverage_factors(dof, array[:, None])
-        u = np.sqrt(np.diagonal(self.covar))
-        lower, upper = around(self.problem.space, values, u, k)
+        u = np.sqrt(np.diagonal(errors.covariance))
+        lower, upper = around(errors.problem.space, errors.values, u, k)
         asked, deviance = self._far_deviance
         if asked.size:
+            places = errors.places(self.optimum.names[i] for i in asked)
             q = thresholds(self.by_noise, array)
             below, above = deviance[:, None] < q[:, None] ** 2
-            lower[:, asked] = np.where(below, 0.0, lower[:, asked])
-            upper[:, asked] = np.where(above, np.inf, upper[:, asked])
-        ln_u = np.array([p.std for p in assumed])
-        ln_U = coverage_factors(self.errors.least_dof, array[:, None]) * ln_u
-        assumed_values = np.array([p.value for p in assumed])
-        low, high = within_ranges(
-            assumed_values * np.exp(-ln_U),
-            assumed_values * np.exp(ln_U),
-            assumed_values,
-            [p.range for p in assumed],
-        )
-        note = f"every source of the budget, {self.errors.effective:.0f} effective samples"
-        return ConfidenceIntervals(
-            "combined",
-            array,
-            (*self.problem.names, *(p.name for p in assumed)),
-            (*(p.unit for p in self.problem.parameters), *(p.unit for p in assumed)),
-            np.append(values, assumed_values),
-            np.hstack([lower, low]),
-            np.hstack([upper, high]),
-            note,
+            lower[:, places] = np.where(below, 0.0, lower[:, places])
+            upper[:, places] = np.where(above, np.inf, upper[:, places])
+        note = f"every source of the budget, {errors.effective:.0f} effective samples"
+        return intervals_of(
+            errors, self.optimum.names, errors.assumed, array, errors.values, (lower, upper), note
         )
 
     @cached_property
@@ -295,18 +280,24 @@ class RecordAssessment(Assessment):
         """The parameters that may have an open side, (n,), and their deviances far off, (2, n)."""
         count = 0 if self.first_order else self.problem.n_reported
         with np.errstate(divide="ignore"):
-            u = np.sqrt(np.diagonal(self.errors.contributions[NOISE])) / self.optimum.values
+            u = np.sqrt(np.diagonal(self.covar_noise)) / self.optimum.values
         asked = np.flatnonzero((self.problem.space.positive & ~(u <= LARGE))[:count])
         if not asked.size:
             return asked, np.zeros((2, 0))
         return asked, Profiler(self.by_noise).far_deviance(asked)
+
+    @property
+    def _directions(self) -> FloatArray:
+        """Directions of the free values among all estimates."""
+        errors = self.errors
+        return np.eye(len(errors.names))[errors.places(self.optimum.names)]
 
     @cached_property
     def identifiability(self) -> Identifiability:
         """Which parameters of the model the records determine."""
         free, limits = self.problem.free, self.intervals("combined")
         verdicts = {}
-        for p, direction in zip(free, np.eye(len(self.covar)), strict=False):
+        for p, direction in zip(free, self._directions, strict=False):
             u = float(self.errors.std(direction)) / _natural_size(p, self.known[0][p.name])
             U = coverage_factor(self.errors.dof(direction)) * u
             verdict = Verdict.WEAK if 0.5 * U > IDENTIFIED_BELOW else Verdict.IDENTIFIED
@@ -343,11 +334,7 @@ class RecordAssessment(Assessment):
     @property
     def contradicted_exponents(self) -> Iterator[ContradictedExponent]:
         """The exponents that the records contradict, or put outside their range."""
-        for p in self.errors.exponents:
-            if p.contradicted:
-                value = p.value * float(np.exp(p.log_ratio))
-                u, limits = value * p.log_ratio_std, p.range if p.assumed else None
-                yield ContradictedExponent(p.name, p.value, value, u, limits)
+        return iter(self.errors.contradicted)
 
     @property
     def significant_misfit(self) -> tuple[float, float] | None:
@@ -406,10 +393,10 @@ class RecordAssessment(Assessment):
         parameters = tuple(
             parameter_budget(errors, p.name, shown_unit(p.unit, problem.motion), value, direction)
             for p, value, direction in zip(
-                problem.free, self.optimum.values.tolist(), np.eye(len(self.covar)), strict=False
+                problem.free, self.optimum.values.tolist(), self._directions, strict=False
             )
         )
-        return Budget(parameters, errors.covariance[:count, :count], errors.exact)
+        return Budget(parameters, self.covar[:count, :count], errors.exact)
 
     def derived(
         self, amplitudes: Sequence[float], frequency_hz: float | None

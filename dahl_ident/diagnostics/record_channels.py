@@ -117,7 +117,7 @@ def _if_it_matters(
     fit: LinearFit, name: str, contribution: FloatArray
 ) -> Iterator[tuple[str, FloatArray]]:
     larger = contribution.diagonal() > _MATTERS**2 * fit.by_noise[0].diagonal()
-    if larger[fit.of_model].any():
+    if larger[fit.of_model & (fit.unmeasured > 0.0)].any():
         yield name, contribution
 
 

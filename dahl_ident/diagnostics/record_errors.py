@@ -32,6 +32,7 @@ from dahl_ident.diagnostics.contributions import (
     satterthwaite,
     variances,
 )
+from dahl_ident.diagnostics.estimate import assumed_exponents
 from dahl_ident.diagnostics.record_channels import (
     DISPLACEMENT_GAIN,
     DRIVE,
@@ -44,12 +45,13 @@ from dahl_ident.diagnostics.record_channels import (
 )
 from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
-    FixedExponent,
+    ContradictedExponent,
     LinearFit,
     between_records,
     blocks_of,
+    by_exponents,
+    contradicted_exponents,
     correlated,
-    fixed_exponents,
     noise_in,
     sandwich,
 )
@@ -81,10 +83,14 @@ _SHORTENS = 0.5  # part of u: without a smaller source, intervals are at most 10
 class MotionMisfit:
     """Dependence of the residuals on the motion's state that exceeds chance."""
 
-    covariance: FloatArray  # (P, P): of the estimate, due to this dependence
+    scores: FloatArray  # (Q, Q): covariance of J'e due to this dependence
     follows: str  # quantity that explains most of the residuals
     share: float  # of their variance that it explains
     functions: int  # number of functions from which the covariance was estimated
+
+    def covariance(self, fit: LinearFit) -> FloatArray:
+        """Return the covariance of the estimate due to this dependence."""
+        return np.asarray(fit.inverse @ self.scores @ fit.inverse)
 
 
 def motion_misfit(
@@ -96,11 +102,8 @@ def motion_misfit(
     error. None if chance explains the dependence.
     """
     problem, values, residuals = fit.problem, fit.values, fit.residuals
-    slopes = fit.exponent_slopes
-    assumed = [slopes[p.name] for p in problem.exponents if p.assumed and p.name in slopes]
-    freed = fit.with_freed(*assumed)
     ends, count = np.cumsum([e.size for e in residuals])[:-1], values.size
-    J, e = np.concatenate(freed.jacobians), np.concatenate(residuals)
+    J, e = np.concatenate(fit.jacobians), np.concatenate(residuals)
     channels = [np.concatenate(changes) for changes in other_motions]
     with suppress(FitError):  # no motion close to the estimate
         channels.append(np.concatenate(fit.delay_slopes))
@@ -115,10 +118,9 @@ def motion_misfit(
         wave = np.concatenate([problem.filtered(part[name]) for part in parts])
         waves[name] = _basis(wave, _SEEN)
     unexplained = {name: _part(B - known @ (known.T @ B), _SEEN) for name, B in waves.items()}
-    gain = freed.inverse[:count] @ J.T
     starts = np.append(0, ends)
     blocks = [starts[number] + rows for number, rows in blocks_of(residuals, _BLOCKS)]
-    covariance, significant = np.zeros((count, count)), dict[str, tuple[float, int]]()
+    scores, significant = np.zeros((count, count)), dict[str, tuple[float, int]]()
     for name, Q in unexplained.items():
         remaining = e - Q @ (Q.T @ e)
         if not (Q.shape[1] and remaining.any()):
@@ -136,13 +138,13 @@ def motion_misfit(
             continue
         along = Q.T @ waves[name]
         unit = float(np.trace(np.linalg.solve(by_noise, along @ along.T)))
-        moved = gain @ waves[name]
-        covariance += (square - expected) / unit * moved @ moved.T
+        seen = J.T @ waves[name]
+        scores += (square - expected) / unit * seen @ seen.T
         significant[name] = float(fitted @ fitted) / float(e @ e), Q.shape[1]
     if not significant:
         return None
     follows = max(significant, key=lambda name: significant[name][0])
-    return MotionMisfit(covariance, follows, *significant[follows])
+    return MotionMisfit(scores, follows, *significant[follows])
 
 
 def _between_blocks(
@@ -246,18 +248,24 @@ def _forces(
 class RecordErrors(ErrorContributions):
     """Covariance of the estimate, source by source."""
 
-    contributions: Mapping[str, FloatArray]  # (P, P) each, noise first
+    problem: RecordProblem
+    values: FloatArray  # (Q,): the estimate
+    contributions: Mapping[str, FloatArray]  # (Q, Q) each, noise first
     effective: float  # samples of white noise with the same information as the residuals
     exact: tuple[str, ...]  # inputs without a stated uncertainty
-    runs: int  # records that were fitted together
-    exponents: tuple[FixedExponent, ...]
+    assumed: tuple[str, ...] = ()
+    contradicted: tuple[ContradictedExponent, ...] = ()
     # dependence of the residuals on the motion, from which `ALONG_MOTION` was estimated
     misfit: MotionMisfit | None = None
 
+    def of_values(self, covariance: FloatArray) -> FloatArray:
+        """Return the covariance: the estimates are the values."""
+        return covariance
+
     @property
-    def assumed(self) -> list[FixedExponent]:
-        """The exponents that the user did not state."""
-        return [exponent for exponent in self.exponents if exponent.assumed]
+    def runs(self) -> int:
+        """Number of runs that were fitted together."""
+        return len(set(self.problem.runs))
 
     @property
     def least_dof(self) -> float:
@@ -288,44 +296,47 @@ class RecordErrors(ErrorContributions):
 
 
 def record_errors(
-    problem: RecordProblem,
-    values: FloatArray,
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
+    problem: RecordProblem, values: FloatArray, residuals: Sequence[FloatArray]
 ) -> RecordErrors:
     """Return the errors of an estimate.
 
     A misfit differs between the parts of a record: if estimates from blocks of a record scatter
     more than noise explains, the excess is the model error; a misfit that depends on the motion is
     a separate source. If estimates from several records scatter more than that, the excess is the
-    scatter between runs. An assumed exponent contributes what it adds to all of these if it is
-    estimated within its range. Errors of the channels are those of
-    :mod:`dahl_ident.diagnostics.record_channels`.
+    scatter between runs. An assumed exponent is estimated within its range, and contributes what
+    that adds. Errors of the channels are those of :mod:`dahl_ident.diagnostics.record_channels`.
 
-    `jacobians` and `residuals` are the derivatives of each record's prediction, and measured minus
-    predicted; for a robust fit, the scores.
+    `residuals` are measured minus predicted; for a robust fit, the scores.
     """
-    fit = LinearFit.of(problem, values, jacobians, residuals)
-    covariance, effective = fit.by_noise
-    sources = {NOISE: covariance}
-    if fit.between_blocks is not None:
-        sources[MODEL_ERROR] = fit.between_blocks
+    assumed = assumed_exponents(problem.model)
+    try:
+        fit = LinearFit.of(problem, values, residuals, assumed)
+    except FitError:  # no motion next to the estimate
+        fit, assumed = LinearFit.of(problem, values, residuals), {}
     noisier, other_motions = with_noisier_displacement(fit), by_other_motions(fit)
     by_motion = partial(motion_sources, noisier=noisier, other_motions=other_motions)
-    of_motion = dict(by_motion(fit))
-    exact = np.asarray(sum([*sources.values(), *of_motion.values()]))
-    exponents = fixed_exponents(fit, by_motion, exact)
-    if (scatter := between_records(fit, np.asarray(sum(sources.values())))) is not None:
+    misfit, exact = motion_misfit(fit, other_motions.values()), fit
+    if assumed:
+        free = fit.covariance(by_motion) + (misfit.covariance(fit) if misfit else 0.0)
+        places = {fit.problem.names.index(name): std for name, std in assumed.items()}
+        exact = fit.assuming(dict.fromkeys(places, 0.0), free.diagonal())
+        stds = {i: std * float(fit.values[i]) for i, std in places.items()}
+        fit = fit.assuming(stds, free.diagonal())
+    covariance, effective = exact.by_noise
+    sources = {NOISE: covariance}
+    if exact.between_blocks is not None:
+        sources[MODEL_ERROR] = exact.between_blocks
+    if (scatter := between_records(fit)) is not None:
         sources[RUNS] = scatter
-    sources |= of_motion
+    sources |= dict(by_motion(exact))
     known = np.asarray(sum(sources.values()))
-    if assumed := [exponent.contribution for exponent in exponents if exponent.assumed]:
-        sources[EXPONENT] = np.asarray(sum(assumed))
-    misfit = motion_misfit(fit, other_motions.values())
+    if assumed:
+        sources[EXPONENT] = by_exponents(fit, exact, by_motion)
     if misfit is not None:
-        larger = misfit.covariance.diagonal() > _SHORTENS**2 * known.diagonal()
-        if larger[fit.of_model].any():
-            sources[ALONG_MOTION] = misfit.covariance
+        along_motion = misfit.covariance(fit)
+        larger = along_motion.diagonal() > _SHORTENS**2 * known.diagonal()
+        if larger[fit.of_model & (exact.unmeasured > 0.0)].any():
+            sources[ALONG_MOTION] = along_motion
         else:
             misfit = None
     for name, contribution in by_calibration(fit):
@@ -337,8 +348,16 @@ def record_errors(
             unstated.insert(FORCE in unstated, "the drive (its noise cannot be estimated)")
         elif of_drive.any():
             sources[DRIVE] = of_drive
-    runs = len(set(problem.runs))
-    return RecordErrors(sources, effective, tuple(unstated), runs, exponents, misfit)
+    return RecordErrors(
+        fit.problem,
+        fit.values,
+        sources,
+        effective,
+        tuple(unstated),
+        tuple(assumed),
+        tuple(contradicted_exponents(problem, values, residuals, by_motion)),
+        misfit,
+    )
 
 
 def errors_on_constraints(
@@ -357,5 +376,4 @@ def errors_on_constraints(
     covariance = along @ reduced @ along.T
     covariance[lost, lost] = np.inf
     exact = ("every source other than noise",)
-    runs = len(set(optimum.problem.runs))
-    return RecordErrors({NOISE: covariance}, effective, exact, runs, ())
+    return RecordErrors(optimum.problem, optimum.values, {NOISE: covariance}, effective, exact)

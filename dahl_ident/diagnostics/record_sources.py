@@ -13,7 +13,7 @@ by an autoregressive model, its order by Akaike's criterion, and their covarianc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,7 +25,6 @@ from scipy.linalg import solve_toeplitz, toeplitz
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray, unit_diagonal
 from dahl_ident.diagnostics.contributions import excess, positive_part
-from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.record_search import STEPS, RecordSearch, noise_power
 from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
@@ -50,34 +49,73 @@ Sources: TypeAlias = Callable[["LinearFit"], Iterable[tuple[str, FloatArray]]]
 """Returns covariances of a fit's values, (P, P), by source."""
 
 
+class ContradictedExponent(NamedTuple):
+    """An assumed or stated exponent, and the different one that the data indicate."""
+
+    name: str
+    fixed: float
+    indicated: float
+    stderr: float
+    range: tuple[float, float] | None  # None where the user stated the value
+
+
 @dataclass(frozen=True)
 class LinearFit:
     """A fit of records to first order; residuals and derivatives are filtered as in the fit."""
 
-    problem: RecordProblem
-    values: FloatArray  # (P,): the estimate
-    jacobians: Sequence[FloatArray]  # (n, P): derivatives of each record's prediction
+    problem: RecordProblem  # its names order every array here
+    values: FloatArray  # (Q,): the estimate
+    jacobians: Sequence[FloatArray]  # (n, Q): derivatives of each record's prediction
     residuals: Sequence[FloatArray]  # (n,): measured minus predicted
     noise: Sequence[FloatArray]  # autocovariances of the residuals' noise
-    of_model: BoolArray  # (P,): parameters that are not states or offsets of records
+    of_model: BoolArray  # (Q,): parameters that are not states or offsets of records
+    # (Q,): standard uncertainties without the records: those of assumed values, or 0 where they are
+    # taken as exact; infinite for all others
+    unmeasured: FloatArray
+    information: FloatArray  # (Q,): what is known without the records, in units of J'J
 
     @classmethod
     def of(
         cls,
         problem: RecordProblem,
         values: FloatArray,
-        jacobians: Sequence[FloatArray],
         residuals: Sequence[FloatArray],
+        free: Iterable[str] = (),
     ) -> LinearFit:
-        """Return the fit with these derivatives and residuals, which are filtered here."""
-        J, e = ([problem.filtered(wave) for wave in waves] for waves in (jacobians, residuals))
-        of_model = np.arange(values.size) < len(problem.free)
-        return cls(problem, values, J, e, noise_in(J, e), of_model)
+        """Return the fit with these residuals, filtered here, and some exponents free.
+
+        Raises
+        ------
+        FitError
+            If the motion next to the estimate cannot be computed.
+        """
+        wider = problem.freed(free)
+        values = problem.values_in(wider, values)
+        numbers = range(len(wider.records))
+        J = [wider.filtered(wider.predict(values, number).by) for number in numbers]
+        e = [wider.filtered(wave) for wave in residuals]
+        of_model = np.arange(values.size) < len(wider.free)
+        unmeasured, information = np.full(values.size, np.inf), np.zeros(values.size)
+        return cls(wider, values, J, e, noise_in(J, e), of_model, unmeasured, information)
+
+    def assuming(self, stds: Mapping[int, float], variances: FloatArray) -> LinearFit:
+        """Return the fit with some values that have standard uncertainties without the records.
+
+        `variances`, (Q,), are those of the estimate from the records alone, with which what is
+        assumed is weighted.
+        """
+        unmeasured, information = self.unmeasured.copy(), self.information.copy()
+        white = sum(float(e @ e) for e in self.residuals) / sum(e.size for e in self.residuals)
+        for i, std in stds.items():
+            unit = self.inverse[i, i]
+            noise = variances[i] / unit if np.isfinite(variances[i]) else white
+            unmeasured[i], information[i] = std, noise / std**2 if std else np.inf
+        return replace(self, unmeasured=unmeasured, information=information)
 
     @cached_property
     def by_noise(self) -> tuple[FloatArray, float]:
         """Covariance of the estimate from noise, and the effective number of samples."""
-        return sandwich(self.jacobians, self.residuals, self.noise)
+        return sandwich(self.jacobians, self.residuals, self.noise, self.information)
 
     @cached_property
     def between_blocks(self) -> FloatArray | None:
@@ -89,42 +127,14 @@ class LinearFit:
 
     @cached_property
     def inverse(self) -> FloatArray:
-        """Inverse of the normal matrix, (P, P)."""
-        return inverse_normal(self.jacobians)
+        """Inverse of the normal matrix, (Q, Q)."""
+        normal, size = normal_matrix(self.jacobians, self.information)
+        return np.asarray(np.linalg.pinv(normal, hermitian=True) / np.outer(size, size))
 
     @cached_property
     def outputs(self) -> Sequence[FloatArray]:
         """Predicted outputs."""
         return self.problem.outputs(self.values)
-
-    @cached_property
-    def exponent_slopes(self) -> Mapping[str, Waves]:
-        """Derivatives of the outputs with respect to ln of each fixed exponent, by name.
-
-        Empty if the motion near the estimate cannot be computed.
-        """
-        problem = self.problem
-        if not problem.exponents:
-            return {}
-        free = problem.freed([p.name for p in problem.exponents])
-        known = {p.name: p.value for p in problem.exponents}
-        known |= dict(zip(problem.names, self.values.tolist(), strict=True))
-        values = np.array([known[name] for name in free.names], dtype=np.float64)
-        try:
-            slopes = [free.predict(values, number).by for number in range(len(problem.records))]
-        except FitError:
-            return {}
-        columns = {p.name: free.names.index(p.name) for p in problem.exponents}
-        return {
-            name: [problem.filtered(values[i] * J[:, i]) for J in slopes]
-            for name, i in columns.items()
-        }
-
-    def with_freed(self, *slopes: Waves) -> LinearFit:
-        """Return the fit with additional parameters at the end, which have these derivatives."""
-        jacobians = [np.column_stack(waves) for waves in zip(self.jacobians, *slopes, strict=True)]
-        of_model = np.append(self.of_model, np.ones(len(slopes), dtype=bool))
-        return replace(self, jacobians=jacobians, of_model=of_model)
 
     def projected(self, waves: Waves) -> FloatArray:
         """Return the change of the estimate due to filtered changes of the measured outputs."""
@@ -146,171 +156,107 @@ class LinearFit:
         return [self.problem.filtered(slope) for slope in self.problem.delay_slopes(self.values)]
 
     def covariance(self, sources: Sources | None = None) -> FloatArray:
-        """Return the covariance from noise, scatter between blocks and other `sources`, (P, P)."""
-        parts = [self.by_noise[0], self.between_blocks]
+        """Return the covariance from noise, scatter between blocks and other `sources`, (Q, Q).
+
+        What the estimate owes to assumed values is as uncertain as they are.
+        """
+        at = np.flatnonzero((self.unmeasured > 0.0) & (self.unmeasured < np.inf))
+        moved = self.inverse[:, at] * self.information[at] * self.unmeasured[at]
+        parts = [self.by_noise[0], self.between_blocks, moved @ moved.T]
         parts += [part for _, part in sources(self)] if sources else []
         return np.asarray(sum(part for part in parts if part is not None))
 
+    def shifted(self, place: int, limits: tuple[float, float] = (-np.inf, np.inf)) -> FloatArray:
+        """Return the covariance, (Q, Q), due to a value that is not at the optimum.
 
-@dataclass(frozen=True)
-class FixedExponent:
-    """An exponent that the fit holds fixed, and what the records show about it."""
-
-    name: str
-    unit: str
-    value: float  # at which it is fixed
-    range: tuple[float, float]  # in which it may lie; only `value` if the user stated it
-    std: float  # of its logarithm, from the records and the range together
-    # ln of the estimate from the records alone, which may be outside the range, over `value`, and
-    # its standard deviation
-    log_ratio: float
-    log_ratio_std: float
-    # (P, P): covariance of the estimate due to the exponent's uncertainty, or due to its distance
-    # from the value that the records indicate, whichever is larger
-    contribution: FloatArray
-    others: FloatArray  # (P,): changes of the values per change of the logarithm
-    assumed: bool  # whether the fit assumes it, because the user stated none
-
-    @property
-    def contradicted(self) -> bool:
-        """Whether the records contradict the value."""
-        return abs(self.log_ratio) > _CONTRADICTED * self.log_ratio_std
-
-    def __str__(self) -> str:
-        low, high = self.range
-        value = with_unit(self.value, self.value * self.std, self.unit)
-        return f"{self.name} between {low:g} and {high:g} (here {value})"
+        That is the square of the change of this value to the optimum, within `limits`, in excess of
+        its variance.
+        """
+        variance = self.covariance()[place, place]
+        change = np.clip(self.projected(self.residuals)[place], *limits)
+        line = self.inverse[:, place] / (self.inverse[place, place] or 1.0)
+        return np.asarray(max(change**2 - variance, 0.0) * np.outer(line, line))
 
 
-def fixed_exponents(
-    fit: LinearFit, sources: Sources, exact: FloatArray
-) -> tuple[FixedExponent, ...]:
-    """Return what the records show about each fixed exponent, stated or assumed.
+def by_exponents(fit: LinearFit, exact: LinearFit, sources: Sources) -> FloatArray:
+    """Return the covariance due to assumed exponents, (Q, Q), in excess of that of `exact` ones."""
+    covariance = excess(fit.covariance(sources), exact.covariance(sources))
+    for i in np.flatnonzero(np.isfinite(fit.unmeasured)).tolist():
+        low, high = fit.problem.parameters[i].prior or (0.0, np.inf)
+        covariance += fit.shifted(i, (low - fit.values[i], high - fit.values[i]))
+    return covariance
 
-    Its uncertainty is due to noise, scatter between blocks, and `sources`; `exact` is the
-    covariance of the estimate due to all of these with the exponents fixed.
 
-    A stated exponent is estimated by a search in which it is free. An assumed one, which is close
-    to its optimum, is estimated by a Gauss-Newton step, and by a search if that step is long. As
-    for tables, the range is taken as a uniform distribution of the logarithm; its weight is less if
-    the records contain more information.
+def by_delay(fit: LinearFit) -> FloatArray:
+    """Return the covariance of the estimate due to the delay, (Q, Q).
+
+    The estimated delay has been removed, unless it is too long for that. The remaining delay has
+    the problem's `delay_std`; unless the user stated it, it has at least what the records show in
+    excess of chance.
     """
-    exponents = []
-    for p in (p for p in fit.problem.exponents if p.name in fit.exponent_slopes):
-        freed = _FreedValue.of(fit, fit.exponent_slopes[p.name], sources)
-        value, limits = float(p.value or 1.0), p.prior or (1.0, 1.0)
-        low, high = (float(np.log(end / value)) for end in limits)
-        low, high = min(low, 0.0), max(high, 0.0)
-        ratio, ratio_std = freed.change, float(freed.covariance[-1, -1]) ** 0.5
-        mean, s = float(np.clip(ratio, low, high)), (high - low) / 12**0.5
-        std, covariance = freed.with_prior(mean, freed.widened(mean, s), exact)
-        if not p.assumed or abs(ratio) > max(_LINEAR, _CONTRADICTED * ratio_std):
-            with suppress(FitError):  # the motion cannot be computed at values that are tried
-                ratio, ratio_std = _searched_ratio(fit, p.name, sources) or (ratio, ratio_std)
-        exponents.append(
-            FixedExponent(
-                p.name,
-                p.unit,
-                value,
-                limits,
-                std,
-                ratio,
-                ratio_std,
-                covariance,
-                freed.others,
-                p.assumed,
-            )
-        )
-    return tuple(exponents)
+    unit = fit.problem.delay_std
+    slopes = zip(fit.jacobians, fit.delay_slopes, strict=True)
+    free = replace(
+        fit,
+        jacobians=[np.column_stack([J, unit * slope]) for J, slope in slopes],
+        of_model=np.append(fit.of_model, True),
+        unmeasured=np.append(fit.unmeasured, np.inf),
+        information=np.append(fit.information, 0.0),
+    )
+    variances, square = free.covariance().diagonal(), 1.0
+    if "delay" not in fit.problem.calibration and np.isfinite(variances[-1]):
+        by_chance = _CONTRADICTED**2 * variances[-1]
+        square = max(1.0, float(free.projected(free.residuals)[-1]) ** 2 - by_chance)
+    delayed = free.assuming({-1: square**0.5}, variances)
+    total = delayed.covariance()[:-1, :-1]
+    return excess(total, fit.covariance()) + delayed.shifted(-1)[:-1, :-1]
+
+
+def contradicted_exponents(
+    problem: RecordProblem, values: FloatArray, residuals: Sequence[FloatArray], sources: Sources
+) -> Iterator[ContradictedExponent]:
+    """Yield the fixed exponents, stated or assumed, that the records contradict.
+
+    Its uncertainty is due to noise, scatter between blocks, and `sources`. A stated exponent is
+    estimated by a search in which it is free. An assumed one, which is close to its optimum, is
+    estimated by a Gauss-Newton step, and by a search if that step is long.
+    """
+    for p in problem.exponents:
+        with suppress(FitError):  # the motion cannot be computed at values that are tried
+            freed = LinearFit.of(problem, values, residuals, [p.name])
+            i, value = freed.problem.names.index(p.name), float(p.value or 1.0)
+            ratio = float(freed.projected(freed.residuals)[i]) / value
+            u = float(freed.covariance(sources)[i, i]) ** 0.5 / value
+            if not p.assumed or abs(ratio) > max(_LINEAR, _CONTRADICTED * u):
+                ratio, u = _searched_ratio(freed, p.name, sources) or (ratio, u)
+            if abs(ratio) > _CONTRADICTED * u:
+                indicated = value * float(np.exp(ratio))
+                limits = p.prior if p.assumed else None
+                yield ContradictedExponent(p.name, value, indicated, indicated * u, limits)
 
 
 def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float, float] | None:
     """Return ln of an exponent's estimate over its value, and its standard deviation, by a search.
 
-    None if the fixed exponent describes the records better. The noise of the displacement is
-    estimated again, because its estimate with the exponent fixed may contain misfit. Far from the
-    value the model is not linear: the distance has at most as many standard deviations as the fall
-    of the cost shows.
+    `fit` is the fit in which it is free. None if the fixed exponent describes the records better.
+    The noise of the displacement is estimated again, because its estimate with the exponent fixed
+    may contain misfit. Far from the value the model is not linear: the distance has at most as many
+    standard deviations as the fall of the cost shows.
     """
-    problem = fit.problem
-    search, free = RecordSearch("lm", "linear"), problem.freed([name])
-    i = free.names.index(name)
-    (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
-    start = free.to_search(np.insert(fit.values, i, value))
+    search, free = RecordSearch("lm", "linear"), fit.problem
+    i, start = free.names.index(name), free.to_search(fit.values)
     cost, free = float(free.quadratic(start).cost), free.smoothed(on=False).without_noise(0.0)
     end = search.descend(free, start, STEPS)
-    if problem.output == "force":
+    if free.output == "force":
         free, end = search.without_noise(free, end)
     if not end.converged[0] or not end.cost[0] < cost:
         return None
     values = free.to_values(end.theta[0])
-    predicted = [free.predict(values, number) for number in range(len(problem.records))]
-    e = [y - p.output for y, p in zip(free.measured, predicted, strict=True)]
-    at_end = LinearFit.of(free, values, [p.by for p in predicted], e)
-    u = float(at_end.covariance(sources)[i, i]) ** 0.5 / float(values[i])
-    ratio, fall = float(np.log(values[i] / value)), cost - float(end.cost[0])
+    e = free.split_residuals(values)
+    u = float(LinearFit.of(free, values, e).covariance(sources)[i, i]) ** 0.5 / float(values[i])
+    ratio, fall = float(np.log(values[i] / fit.values[i])), cost - float(end.cost[0])
     deviance = 2.0 * fall / noise_power(float(end.cost[0]), free.n_residuals, e)
     return ratio, max(u, abs(ratio) / deviance**0.5)
-
-
-def by_delay(fit: LinearFit) -> FloatArray:
-    """Return the covariance of the estimate due to the delay.
-
-    The estimated delay has been removed, unless it is too long for that. The prior of the
-    remaining delay has the problem's `delay_std`, which is widened unless the user stated it.
-    """
-    unit, stated = fit.problem.delay_std, "delay" in fit.problem.calibration
-    freed = _FreedValue.of(fit, [unit * slope for slope in fit.delay_slopes])
-    s = 1.0 if stated else freed.widened(freed.change, 1.0)
-    return freed.with_prior(freed.change, s, fit.covariance())[1]
-
-
-class _FreedValue(NamedTuple):
-    """A value that a fit holds fixed, estimated by a Gauss-Newton step."""
-
-    change: float  # its estimate from the records minus the fixed value
-    covariance: FloatArray  # (P + 1, P + 1): of the other values and, last, of this one
-    others: FloatArray  # (P,): changes of the other values per change of this one
-
-    @classmethod
-    def of(cls, fit: LinearFit, slopes: Waves, sources: Sources | None = None) -> _FreedValue:
-        """Return the value with respect to which `slopes` are derivatives of the outputs."""
-        joint = fit.with_freed(slopes)
-        others = np.zeros(len(joint.inverse) - 1)
-        if any(slope.any() for slope in slopes):  # without a drive, a delay has no effect
-            others = joint.inverse[:-1, -1] / joint.inverse[-1, -1]
-        change = float(joint.projected(joint.residuals)[-1])
-        return cls(change, joint.covariance(sources), others)
-
-    def widened(self, mean: float, s: float) -> float:
-        """Return the standard deviation `s` of an assumed prior, with less weight than the records.
-
-        It is wider if the estimate from the records, `mean`, contradicts the prior.
-        """
-        u2 = float(self.covariance[-1, -1])
-        if not np.isfinite(u2):
-            return s
-        contradiction = max(mean**2 - _CONTRADICTED**2 * u2, 0.0) ** 0.5
-        return float(max(s, s**2 / max(u2, 1e-300) ** 0.5, contradiction))
-
-    def with_prior(self, mean: float, s: float, exact: FloatArray) -> tuple[float, FloatArray]:
-        """Return the standard deviation of the value, and what it adds to the others' covariance.
-
-        `mean` is the estimate from the records, `s` the standard deviation of the prior, and
-        `exact` the covariance of the other values if this one is exact.
-        """
-        u2, C = float(self.covariance[-1, -1]), self.covariance
-        line = np.outer(self.others, self.others)
-        if not np.isfinite(u2):
-            return s, s**2 * line
-        weight = s**2 / (s**2 + u2)
-        shrink = np.column_stack([np.eye(self.others.size), (weight - 1.0) * self.others])
-        total = shrink @ np.where(np.isfinite(C), C, 0.0) @ shrink.T
-        total += ((1.0 - weight) * s) ** 2 * line
-        lost = np.isinf(C.diagonal()[:-1])
-        total[lost, lost] = np.inf
-        beyond = max((weight * mean) ** 2 - weight * u2, 0.0)
-        return (weight * u2) ** 0.5, excess(total, exact) + beyond * line
 
 
 def blocks_of(waves: Sequence[FloatArray], blocks: int = BLOCKS) -> list[tuple[int, IntArray]]:
@@ -325,8 +271,8 @@ def blocks_of(waves: Sequence[FloatArray], blocks: int = BLOCKS) -> list[tuple[i
     ]
 
 
-def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
-    """Return the covariance between records in excess of `known`; None if chance explains it.
+def between_records(fit: LinearFit) -> FloatArray | None:
+    """Return the covariance between records that noise and blocks do not explain, or None.
 
     A record counts once, however many samples or parts it has: the problem's `runs` state to which
     record each part belongs.
@@ -335,6 +281,7 @@ def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
     whole = [np.arange(e.size) for e in fit.residuals]
     members = [np.flatnonzero(runs == run).tolist() for run in np.unique(runs)]
     records = [[(i, whole[i]) for i in each] for each in members]
+    known = fit.covariance()
     return _between(fit, records, known, _RECORDS_CONFIDENCE) if len(records) > 1 else None
 
 
@@ -350,9 +297,9 @@ def _between(
     samples of each. The covariance between groups is that of Liang and Zeger, Biometrika 73 (1986)
     13-22.
     """
-    seen = np.flatnonzero(np.isfinite(noise.diagonal()))
+    seen = np.flatnonzero(np.isfinite(noise.diagonal()) & (noise.diagonal() > 0.0))
     inside = np.ix_(seen, seen)
-    if not noise[inside].any():
+    if not seen.size:
         return None
     size = np.sqrt(noise.diagonal()[seen])
     units, scores, parts = np.outer(size, size), [], []
@@ -360,7 +307,8 @@ def _between(
         J = np.concatenate([fit.jacobians[i][rows] for i, rows in group])[:, seen]
         scores.append(size * (J.T @ np.concatenate([fit.residuals[i][rows] for i, rows in group])))
         parts.append(units * (J.T @ J))
-    inverse = np.linalg.inv(sum(parts))
+    known = np.diag(fit.information[seen] * size**2)
+    inverse = np.linalg.inv(sum(parts) + known)
     steps = np.array(scores) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
     by_chance = noise[inside] / units
@@ -379,6 +327,7 @@ def sandwich(
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
     noise: Sequence[FloatArray] | None = None,
+    information: FloatArray | float = 0.0,
 ) -> tuple[FloatArray, float]:
     """Return the covariance of a least-squares estimate, and the effective number of samples.
 
@@ -390,11 +339,14 @@ def sandwich(
         Measured minus predicted.
     noise : sequence of ndarray, optional
         Autocovariances of each record's noise, estimated if left out.
+    information : float or ndarray, shape (P,), default 0.0
+        What is known without the records, in units of J'J; infinite for exact parameters.
 
     Returns
     -------
     covariance : ndarray, shape (P, P)
-        Infinite variances of parameters without an effect, or without one of their own.
+        Zero variances of exact parameters; infinite ones of parameters without an effect, or
+        without one of their own.
     effective : float
         The number of samples, divided by the mean ratio of a parameter's variance to its variance
         with uncorrelated residuals; at most the number of samples.
@@ -411,7 +363,7 @@ def sandwich(
     samples = sum(e.size for e in residuals)
     total = sum(float(e @ e) for e in residuals)
     variance = total / max(samples - P, 1)
-    normal = np.asarray(sum(J.T @ J for J in jacobians))
+    normal, size = normal_matrix(jacobians, information)
     middle = np.zeros((P, P))
     if noise is None:
         noise = noise_in(jacobians, residuals)
@@ -420,9 +372,8 @@ def sandwich(
         columns = np.flatnonzero((J != 0.0).any(axis=0))
         nonzero = J if columns.size == P else J[:, columns]
         middle[np.ix_(columns, columns)] += nonzero.T @ correlated(nonzero, known)
-    normal, size = unit_diagonal(normal)
     middle = middle / np.outer(size, size)
-    covariance_of_theta = np.diag(np.full(P, np.inf))
+    covariance_of_theta = np.diag(np.where(np.isinf(information), 0.0, np.full(P, np.inf)))
     seen = np.flatnonzero(normal.diagonal() > 0.0)
     part = np.ix_(seen, seen)
     values, vectors = np.linalg.eigh(normal[part])
@@ -438,10 +389,18 @@ def sandwich(
     return covariance_of_theta, samples / max(ratio, 1.0)
 
 
-def inverse_normal(jacobians: Sequence[FloatArray]) -> FloatArray:
-    """Return the inverse of the normal matrix J'J of all records, pseudo where it is singular."""
-    normal, size = unit_diagonal(np.asarray(sum(J.T @ J for J in jacobians)))
-    return np.asarray(np.linalg.pinv(normal, hermitian=True) / np.outer(size, size))
+def normal_matrix(
+    jacobians: Sequence[FloatArray], information: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the normal matrix of all records, scaled to unit diagonal, and the scale, (P,).
+
+    The rows of exact parameters, whose `information` is infinite, are zero.
+    """
+    normal = np.asarray(sum(J.T @ J for J in jacobians))
+    exact = np.isinf(np.broadcast_to(information, len(normal)))
+    normal = normal + np.diag(np.where(exact, 0.0, information))
+    normal[exact], normal[:, exact] = 0.0, 0.0
+    return unit_diagonal(normal)
 
 
 def autoregression(

@@ -355,11 +355,8 @@ class RecordSearch:
         assumed = [p.name for p in problem.exponents if p.assumed]
         if not assumed or unexplained(problem, fixed) < EXACT or not fixed.converged[0]:
             return problem, fixed
-        values = problem.to_values(fixed.theta[0]).tolist()
-        known = {p.name: float(p.value or 0.0) for p in problem.exponents}
-        known |= dict(zip(problem.names, values, strict=True))
         wider, end, last = problem.freed(assumed, 1.0), fixed, 0.0
-        theta = wider.to_search([known[name] for name in wider.names])
+        theta = wider.to_search(problem.values_in(wider, problem.to_values(fixed.theta[0])))
         for _ in range(_PRIORS):
             residuals = wider.split_residuals(wider.to_values(theta))
             noise = noise_power(float(end.cost[0]), problem.n_residuals, residuals) ** 0.5

@@ -280,37 +280,30 @@ def _of_records(
             "response, a fit of records whose force it predicts, or the model with "
             f"{argument('ranges')}"
         )
-    free, P = tuple(problem.free), len(problem.free)
-    space, best = Space(free), np.asarray(fit.optimum.values)[:P]
-    slope = space.slopes(best)
+    errors, assumed = fit.errors, fit.errors.assumed
+    parameters, free = tuple(errors.problem.free), tuple(problem.free)
+    n, P, every = len(parameters), len(free), Space(parameters)
+    best = errors.values[:n]
+    slope = every.slopes(best)
+    joint = errors.covariance[:n, :n] / np.outer(slope, slope)
     if values is None:
-        covariance = np.asarray(fit.covar)[:P, :P] / np.outer(slope, slope)
-        if not np.isfinite(covariance).all():
+        if not np.isfinite(joint).all():
             raise ValidationError("plan: the fit does not determine its parameters; give the model")
+        theta = _drawn(rng, every.to_search(best), joint, draws, parameters)
     else:
-        posterior = space.to_search(values[:, :P])
+        posterior = Space(free).to_search(values[:, :P])
+        fitted = np.array([p.name not in assumed for p in parameters])
+        slope = slope[fitted]
+        # changes of the others with the exponents' uncertainty, and noise
+        others = joint[np.ix_(fitted, ~fitted)]
+        known = others @ np.linalg.solve(joint[np.ix_(~fitted, ~fitted)], others.T)
+        known += fit.assessment.covar_noise[:P, :P] / np.outer(slope, slope)
         covariance = np.atleast_2d(np.cov(posterior, rowvar=False))
-    exponents = fit.errors.assumed
-    assumed = tuple(exponent.name for exponent in exponents)
-    model = problem.model.with_free(assumed)
-    parameters = tuple(p for p in model.parameters if p.free)
-    # changes of the others, and of its logarithm, with a standard deviation of each exponent
-    others = np.array([p.std * p.others[:P] / slope for p in exponents]).reshape(-1, P)
-    root = np.vstack([others.T, np.diag([p.std for p in exponents])])
-    joint = root @ root.T
-    noise = fit.errors.contributions[NOISE][:P, :P] / np.outer(slope, slope)
-    joint[:P, :P] += noise + excess(covariance, joint[:P, :P] + noise)
-    names = [*(p.name for p in free), *assumed]
-    order = [names.index(p.name) for p in parameters]
-    joint = joint[np.ix_(order, order)]
-    if values is None:
-        centre = _among(parameters, names[:P], space.to_search(best))
-        theta = _drawn(rng, centre, joint, draws, parameters)
-    else:
+        joint[np.ix_(fitted, fitted)] = known + excess(covariance, known)
         drawn = posterior[rng.integers(len(posterior), size=draws)]
-        theta = _within(_among(parameters, names[:P], drawn), parameters)
+        theta = _within(_among(parameters, [p.name for p in free], drawn), parameters)
     return Knowledge(
-        model,
+        problem.model.with_free(assumed),
         parameters,
         theta,
         _stated(source, parameters),

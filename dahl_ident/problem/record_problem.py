@@ -154,6 +154,15 @@ class RecordProblem(RecordWaves):
                 ranges[name] = np.log(value), np.log(high / low) / 12.0**0.5 / noise
         return self._with_free(self.model.with_parameters(freed), ranges)
 
+    def values_in(self, other: RecordProblem, values: FloatArray) -> FloatArray:
+        """Return the values of a problem with other free parameters, which have their values here.
+
+        `values` are those of this problem.
+        """
+        known = {p.name: p.value for p in self.model.parameters}
+        known |= dict(zip(self.names, values.tolist(), strict=True))
+        return np.array([known[name] for name in other.names], dtype=np.float64)
+
     def in_order(self, theta: ArrayLike) -> FloatArray:
         """Return theta with interchangeable elements in order of their knees, as for tables."""
         alike = Interchangeable(self.model, self.names, endings(self.records))

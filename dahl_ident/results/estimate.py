@@ -506,7 +506,7 @@ def _record_density(
     sources = tuple(name for name, part in errors.contributions.items() if part.any())
     covariance, dof = fit.covar, errors.least_dof
     if uncertainty == "noise":
-        sources, covariance, dof = (NOISE,), errors.contributions[NOISE], errors.dof_of(NOISE)
+        sources, covariance, dof = (NOISE,), fit.assessment.covar_noise, errors.dof_of(NOISE)
     prior, count = joint_prior(problem, priors, values), problem.n_reported
     return RecordDensity(problem, values, covariance[:count, :count], dof, sources, prior)
 
