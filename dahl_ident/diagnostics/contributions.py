@@ -116,10 +116,16 @@ def positive_part(C: FloatArray) -> FloatArray:
 def excess(total: FloatArray, known: FloatArray) -> FloatArray:
     """Return the positive semidefinite part of `total` beyond `known`, scaled to unit diagonal.
 
-    Where either is infinite there is none.
+    Values whose variance is infinite in either have none.
+
+    Examples
+    --------
+    >>> total = np.array([[np.inf, 5.0], [5.0, 3.0]])
+    >>> excess(total, np.diag([np.inf, 1.0])).round(12).tolist()
+    [[0.0, 0.0], [0.0, 2.0]]
     """
-    finite = np.isfinite(total) & np.isfinite(known)
-    total, known = (np.where(finite, C, 0.0) for C in (total, known))
+    finite = np.isfinite(total.diagonal()) & np.isfinite(known.diagonal())
+    total, known = (np.where(np.outer(finite, finite), C, 0.0) for C in (total, known))
     size = np.sqrt(np.maximum(total, known).diagonal())
     units = np.outer(size, size)
     units[units == 0.0] = 1.0

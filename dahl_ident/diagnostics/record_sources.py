@@ -128,8 +128,7 @@ class LinearFit:
     @cached_property
     def inverse(self) -> FloatArray:
         """Inverse of the normal matrix, (Q, Q)."""
-        normal, size = normal_matrix(self.jacobians, self.information)
-        return np.asarray(np.linalg.pinv(normal, hermitian=True) / np.outer(size, size))
+        return inverse_normal(self.jacobians, self.information)[0]
 
     @cached_property
     def outputs(self) -> Sequence[FloatArray]:
@@ -363,7 +362,7 @@ def sandwich(
     samples = sum(e.size for e in residuals)
     total = sum(float(e @ e) for e in residuals)
     variance = total / max(samples - P, 1)
-    normal, size = normal_matrix(jacobians, information)
+    inverse, lost = inverse_normal(jacobians, information)
     middle = np.zeros((P, P))
     if noise is None:
         noise = noise_in(jacobians, residuals)
@@ -372,35 +371,35 @@ def sandwich(
         columns = np.flatnonzero((J != 0.0).any(axis=0))
         nonzero = J if columns.size == P else J[:, columns]
         middle[np.ix_(columns, columns)] += nonzero.T @ correlated(nonzero, known)
-    middle = middle / np.outer(size, size)
-    covariance_of_theta = np.diag(np.where(np.isinf(information), 0.0, np.full(P, np.inf)))
-    seen = np.flatnonzero(normal.diagonal() > 0.0)
-    part = np.ix_(seen, seen)
-    values, vectors = np.linalg.eigh(normal[part])
-    shown = values > _SINGULAR
-    inverse = (vectors[:, shown] / values[shown]) @ vectors[:, shown].T
-    white = inverse * variance
-    covariance = inverse @ middle[part] @ inverse
-    ratio = float(np.mean(covariance.diagonal() / white.diagonal())) if variance > 0.0 else 1.0
-    covariance_of_theta[part] = covariance / np.outer(size[seen], size[seen])
-    lost = seen[(vectors[:, ~shown] ** 2).sum(axis=1) > _INVOLVED]
-    covariance_of_theta[lost], covariance_of_theta[:, lost] = 0.0, 0.0
-    covariance_of_theta[lost, lost] = np.inf
-    return covariance_of_theta, samples / max(ratio, 1.0)
+    covariance = inverse @ middle @ inverse
+    white, seen = variance * inverse.diagonal(), inverse.diagonal() > 0.0
+    ratio = float(np.mean(covariance.diagonal()[seen] / white[seen])) if variance > 0.0 else 1.0
+    covariance[lost], covariance[:, lost] = 0.0, 0.0
+    covariance[lost, lost] = np.inf
+    return covariance, samples / max(ratio, 1.0)
 
 
-def normal_matrix(
+def inverse_normal(
     jacobians: Sequence[FloatArray], information: FloatArray | float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the normal matrix of all records, scaled to unit diagonal, and the scale, (P,).
+) -> tuple[FloatArray, BoolArray]:
+    """Return the inverse of the normal matrix of all records, and what is not determined, (P,).
 
-    The rows of exact parameters, whose `information` is infinite, are zero.
+    It is zero for exact parameters, whose `information` is infinite, and in the directions that the
+    records do not determine.
     """
     normal = np.asarray(sum(J.T @ J for J in jacobians))
     exact = np.isinf(np.broadcast_to(information, len(normal)))
     normal = normal + np.diag(np.where(exact, 0.0, information))
     normal[exact], normal[:, exact] = 0.0, 0.0
-    return unit_diagonal(normal)
+    normal, size = unit_diagonal(normal)
+    seen = np.flatnonzero(normal.diagonal() > 0.0)
+    part = np.ix_(seen, seen)
+    values, vectors = np.linalg.eigh(normal[part])
+    shown = values > _SINGULAR
+    inverse, lost = np.zeros(normal.shape), ~exact
+    inverse[part] = (vectors[:, shown] / values[shown]) @ vectors[:, shown].T
+    lost[seen] = (vectors[:, ~shown] ** 2).sum(axis=1) > _INVOLVED
+    return inverse / np.outer(size, size), lost
 
 
 def autoregression(
