@@ -10,7 +10,6 @@ each reversal.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 
 import numpy as np
 from scipy import fft, special
@@ -44,18 +43,22 @@ WINDOW = "window of differentiation"
 
 
 def motion_sources(
-    fit: LinearFit, noisier: Sequence[Waves], other_motions: Mapping[str, Waves]
+    fit: LinearFit,
+    noisier: Sequence[Waves],
+    other_motions: Mapping[str, Waves],
+    delay: float | None,
 ) -> Iterator[tuple[str, FloatArray]]:
     """Yield the contributions of errors of the motion that widen the interval of a parameter.
 
     Noise in a measured displacement contributes the shift of the estimate by the changes of the
     outputs with `noisier` displacements. If the residuals show larger errors of the displacement at
     turning points, these contribute what exceeds that shift. The changes of the outputs with
-    `other_motions` contribute the shifts that they cause.
+    `other_motions` contribute the shifts that they cause. `delay` is the standard uncertainty of
+    the delay without the records, or None if its effect cannot be computed.
     """
     problem = fit.problem
-    with suppress(FitError):  # no motion next to the estimate
-        yield from _if_it_matters(fit, DELAY, by_delay(fit))
+    if delay is not None:
+        yield from _if_it_matters(fit, DELAY, by_delay(fit, delay))
     if problem.output != "force":
         return
     moved = np.zeros(fit.inverse.shape)

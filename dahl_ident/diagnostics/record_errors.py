@@ -52,8 +52,10 @@ from dahl_ident.diagnostics.record_sources import (
     by_exponents,
     contradicted_exponents,
     correlated,
+    delay_std,
     noise_in,
     sandwich,
+    widened,
 )
 from dahl_ident.elements import Friction
 from dahl_ident.elements.recursion import linear_recursion, stretches
@@ -314,13 +316,16 @@ def record_errors(
     except FitError:  # no motion next to the estimate
         fit, assumed = LinearFit.of(problem, values, residuals), {}
     noisier, other_motions = with_noisier_displacement(fit), by_other_motions(fit)
-    by_motion = partial(motion_sources, noisier=noisier, other_motions=other_motions)
+    delay = None
+    with suppress(FitError):  # no motion next to the estimate
+        delay = delay_std(fit)
+    by_motion = partial(motion_sources, noisier=noisier, other_motions=other_motions, delay=delay)
     misfit, exact = motion_misfit(fit, other_motions.values()), fit
     if assumed:
         free = fit.covariance(by_motion) + (misfit.covariance(fit) if misfit else 0.0)
         places = {fit.problem.names.index(name): std for name, std in assumed.items()}
         exact = fit.assuming(dict.fromkeys(places, 0.0), free.diagonal())
-        stds = {i: std * float(fit.values[i]) for i, std in places.items()}
+        stds = {i: widened(std * fit.values[i], free[i, i]) for i, std in places.items()}
         fit = fit.assuming(stds, free.diagonal())
     covariance, effective = exact.by_noise
     sources = {NOISE: covariance}

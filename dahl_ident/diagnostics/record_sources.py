@@ -23,7 +23,7 @@ import numpy as np
 from scipy import fft, special
 from scipy.linalg import solve_toeplitz, toeplitz
 
-from dahl_ident.arrays import BoolArray, FloatArray, IntArray, unit_diagonal
+from dahl_ident.arrays import TINY, BoolArray, FloatArray, IntArray, unit_diagonal
 from dahl_ident.diagnostics.contributions import excess, positive_part
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.record_search import STEPS, RecordSearch, noise_power
@@ -186,29 +186,48 @@ def by_exponents(fit: LinearFit, exact: LinearFit, sources: Sources) -> FloatArr
     return covariance
 
 
-def by_delay(fit: LinearFit) -> FloatArray:
-    """Return the covariance of the estimate due to the delay, (Q, Q).
+def widened(std: float, variance: float) -> float:
+    """Return the standard uncertainty of an assumption, with less weight than the records.
 
-    The estimated delay has been removed, unless it is too long for that. The remaining delay has
-    the problem's `delay_std`; unless the user stated it, it has at least what the records show in
-    excess of chance.
+    It is larger where the records alone determine the value better, with this `variance`.
     """
+    return max(std, std**2 / max(variance, TINY) ** 0.5) if np.isfinite(variance) else std
+
+
+def delay_std(fit: LinearFit) -> float:
+    """Return the standard uncertainty of the remaining delay without the records.
+
+    It has the unit of the problem's `delay_std`. The estimated delay has been removed, unless it is
+    too long for that. If the user stated none, it is at least what the records show in excess of
+    chance.
+    """
+    free = _with_delay(fit)
+    variance = float(free.covariance()[-1, -1])
+    if "delay" in fit.problem.calibration or not np.isfinite(variance):
+        return 1.0
+    square = float(free.projected(free.residuals)[-1]) ** 2 - _CONTRADICTED**2 * variance
+    return max(widened(1.0, variance), float(max(square, 0.0) ** 0.5))
+
+
+def by_delay(fit: LinearFit, std: float) -> FloatArray:
+    """Return the covariance of the estimate due to the remaining delay, (Q, Q)."""
+    free = _with_delay(fit)
+    delayed = free.assuming({-1: std}, free.covariance().diagonal())
+    total = delayed.covariance()[:-1, :-1]
+    return excess(total, fit.covariance()) + delayed.shifted(-1)[:-1, :-1]
+
+
+def _with_delay(fit: LinearFit) -> LinearFit:
+    """Return the fit with the delay as one more value, the last."""
     unit = fit.problem.delay_std
     slopes = zip(fit.jacobians, fit.delay_slopes, strict=True)
-    free = replace(
+    return replace(
         fit,
         jacobians=[np.column_stack([J, unit * slope]) for J, slope in slopes],
         of_model=np.append(fit.of_model, True),
         unmeasured=np.append(fit.unmeasured, np.inf),
         information=np.append(fit.information, 0.0),
     )
-    variances, square = free.covariance().diagonal(), 1.0
-    if "delay" not in fit.problem.calibration and np.isfinite(variances[-1]):
-        by_chance = _CONTRADICTED**2 * variances[-1]
-        square = max(1.0, float(free.projected(free.residuals)[-1]) ** 2 - by_chance)
-    delayed = free.assuming({-1: square**0.5}, variances)
-    total = delayed.covariance()[:-1, :-1]
-    return excess(total, fit.covariance()) + delayed.shifted(-1)[:-1, :-1]
 
 
 def contradicted_exponents(
