@@ -10,7 +10,7 @@ import dahl_ident as di
 from benchmarks.selection import choices
 from dahl_ident import compare_models, fit
 from dahl_ident.diagnostics.held_out import predictive_density
-from dahl_ident.errors import FitError
+from dahl_ident.errors import DataError, FitError
 from dahl_ident.fitting import Status
 from tests.friction_tables import FRICTION, relative_noise, stated, table
 from tests.histories import integrated_force
@@ -261,6 +261,13 @@ def test_harmonics_of_tiny_covariance_do_not_spoil_the_fundamental():
     plain, gap = comparison.models
     assert gap.density.misfit < 1.1 * plain.density.misfit
     assert comparison.best is plain
+
+
+def test_harmonics_without_their_fundamentals_are_refused():
+    data = with_third(FRICTION)
+    third = data.select(rows=data.harmonic == 3)
+    with pytest.raises(DataError, match="the table has rows of harmonic 3 alone; expected"):
+        fit(third, di.Dahl())
 
 
 def test_a_force_that_falls_with_the_speed_asks_for_lugre():

@@ -274,6 +274,13 @@ def test_what_is_not_determined_is_said_with_the_motion_that_would():
     assert ", not determined, because the motion moves no farther than" in fit.verdict
 
 
+def test_two_springs_of_a_record_cannot_be_distinguished():
+    record = recorded(DAHL + di.Spring(5.0), "random", 800, 1e-3)
+    two = di.Dahl(alpha=1.0) + di.Spring() + di.Spring(name="other")
+    verdict = di.fit(record, two, throw=False).verdict
+    assert "it cannot be distinguished from other_stiffness: fix one of them" in verdict
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_limit_that_no_motion_reaches_is_bounded_from_below(seed):
     """The data are the same for any larger limit."""

@@ -204,6 +204,8 @@ def _largest_source(errors: RecordErrors, place: int) -> str:
     with np.errstate(all="ignore"):
         size = np.sqrt(covariance.diagonal())
         alike = np.abs(covariance[place] / size / size[place]) > _INDISTINGUISHABLE
+    if np.isinf(size[place]):  # with the others that are not determined at all
+        alike = np.isinf(size)
     others = [n for i, n in enumerate(errors.names) if alike[i] and i != place]
     if others:
         return f"it cannot be distinguished from {', '.join(others)}: fix one of them"
