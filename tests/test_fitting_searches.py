@@ -62,6 +62,24 @@ def test_a_search_ends_where_a_bound_cuts_the_valley():
     assert ends.evaluations.mean() < 6.5
 
 
+def test_steps_to_the_limit_of_a_series_end_at_a_bound():
+    """In Powell's example, each Gauss-Newton step is a fixed part of the one before."""
+    low, high, lowest, ratio = np.full(2, 0.1), np.full(2, 2.0), np.inf, 0.9
+
+    def series(theta):
+        nonlocal lowest
+        lowest = min(lowest, theta.min())
+        residuals = np.concatenate([theta + 1.0, ratio * theta**2 + theta - 1.0], axis=1)
+        slopes = np.stack([np.ones(theta.shape), 2.0 * ratio * theta + 1.0], axis=1)
+        return residuals, (slopes[..., None] * np.eye(2)).reshape(-1, 4, 2)
+
+    starts = np.random.default_rng(0).uniform(low, high, (400, 2))
+    ends = searched(series, starts, bounds=(low, high))
+    assert ends.converged.all()
+    np.testing.assert_allclose(ends.theta, np.tile(low, (400, 1)), rtol=1e-12)
+    assert lowest == pytest.approx(0.1, abs=1e-12)
+
+
 def test_logarithms_far_off_are_found_in_few_evaluations():
     best = optimize.curve_fit(lambda t, a, b: a * np.exp(-b * t), TIME, DECAY, [300.0, 2.0])[0]
     starts = np.log(best) + np.random.default_rng(2).uniform([-7.0, -2.0], [7.0, 1.0], (40, 2))

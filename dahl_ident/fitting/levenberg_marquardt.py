@@ -249,7 +249,7 @@ def minimise(
         longest = np.abs(step * logarithmic).max(axis=1)
         factor = np.clip(_LONGEST_STEP / np.maximum(longest, 1e-300), 1.0, factor)
         step = factor[:, None] * step
-        trial = at.theta + step
+        trial = at.theta + step if bounds is None else np.clip(at.theta + step, *bounds)
         new = _State(trial, *evaluate(trial, active))
         evaluations[active] += 1
         # a fall that is lost in the rounding of the cost is assumed to be as predicted
