@@ -204,6 +204,12 @@ def test_an_exponent_beyond_its_range_is_named():
     assert {"beyond_range", "assumed"} <= {finding.code for finding in fit.findings}  # as of tables
 
 
+def test_runs_do_not_scatter_because_an_exponent_is_beyond_its_range():
+    runs = [recorded(di.Dahl(0.1, 30.0, 3.0), "multisine", 400, 1e-3, seed) for seed in (0, 1)]
+    stated, assumed = di.fit(runs, di.Dahl(alpha=2.0)), di.fit(runs, di.Dahl())
+    assert "scatter between runs" not in {*sources(stated, "f_max"), *sources(assumed, "f_max")}
+
+
 def test_an_assumed_exponent_of_a_driven_motion():
     plant = di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
     start = {"f_max": 0.1, "sigma": 300.0}

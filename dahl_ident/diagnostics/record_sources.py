@@ -327,7 +327,8 @@ def _between(
         parts.append(units * (J.T @ J))
     known = np.diag(fit.information[seen] * size**2)
     inverse = np.linalg.inv(sum(parts) + known)
-    steps = np.array(scores) @ inverse
+    change = inverse @ sum(scores)  # to the optimum, off which an assumed range may hold it
+    steps = (np.array(scores) - np.array(parts) @ change) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
     by_chance = noise[inside] / units
     # information of each block on each parameter
