@@ -84,6 +84,23 @@ def test_noise_in_the_drive_shifts_the_estimate_by_what_it_states(seed):
     assert_near(fit, truth, 3.0)
 
 
+def test_noise_in_the_drive_counts_as_much_with_an_exponent_that_only_its_range_limits():
+    t = np.arange(1000) / RATE
+    level = np.interp(t, [0.0, 0.3, 1.0, 1.3], [0.0, 0.05, 0.05, 0.1])
+    drive = level * np.sin(2.0 * np.pi * 26.0 * t)
+    plant = Model(di.Dahl(1.2, 2e4, 1.0) + di.Mass(0.8) + di.Damper(6.0) + di.Spring(3000.0))
+    x = Driven(plant, drive, RATE).motion(np.zeros(3)).states.T[0]
+    noise = np.random.default_rng(1).standard_normal((2, t.size))
+    record = di.Record(t, displacement=x + 4e-7 * noise[0], force=drive + 2e-2 * noise[1])
+    known = di.Mass(0.8) + di.Damper() + di.Spring(3000.0)
+    start = {"f_max": 1.2, "sigma": 2e4, "damping": 6.0}
+    assumed = di.fit(record, di.Dahl() + known, start=start, throw=False)
+    alpha = assumed.params["alpha"].value
+    stated = di.fit(record, di.Dahl(alpha=alpha) + known, start=start, throw=False)
+    u, expected = (sources(fit, "damping")["noise in the drive"] for fit in (assumed, stated))
+    assert u == pytest.approx(expected, rel=0.1)
+
+
 def encoded(x: FloatArray, line: float, noise: float, seed: int = 2) -> di.Record:
     """Return a record of friction, a mass and a damper whose encoder has so many metres a line."""
     t = np.arange(x.size) / RATE

@@ -193,7 +193,7 @@ def by_drive(fit: LinearFit) -> FloatArray | None:
             return zero
         shift += shifted / draws
         moved += np.outer(change, change) / draws
-        seen += sandwich(fit.jacobians, wander)[0] / draws
+        seen += sandwich(fit.jacobians, wander, information=fit.information)[0] / draws
     certain = np.isfinite(known.diagonal()) & (known.diagonal() > 0.0)
     more = np.where(certain, np.maximum((moved - seen).diagonal(), 0.0), 0.0)
     size = np.sqrt(more / np.where(certain, known.diagonal(), 1.0))
