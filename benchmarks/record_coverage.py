@@ -46,14 +46,19 @@ def coloured(seed: int, samples: int, pole: float) -> FloatArray:
 
 
 def force_record(
-    seed: int, pole: float, *, travel_noise: float = 0.0, travel_pole: float = 0.0
+    seed: int,
+    pole: float,
+    *,
+    travel_noise: float = 0.0,
+    travel_pole: float = 0.0,
+    alpha: float = 1.0,
 ) -> di.Record:
     """Return a random displacement and the force of friction and a spring, both with noise."""
     samples = 600
     rng = np.random.default_rng([0, seed])
     x = lfilter([1.0], np.poly([0.97, 0.97, 0.9]), rng.standard_normal(samples))
     x = 1e-2 * x / np.abs(x).max()
-    force = di.Dahl(0.1, 30.0).force(x) + 5.0 * x + 1e-3 * coloured(seed, samples, pole)
+    force = di.Dahl(0.1, 30.0, alpha).force(x) + 5.0 * x + 1e-3 * coloured(seed, samples, pole)
     x = x + travel_noise * coloured(seed + _OTHER, samples, travel_pole)
     return di.Record(np.arange(samples) / RATE, displacement=x, force=force)
 
@@ -71,7 +76,7 @@ def motion_record(seed: int, pole: float, samples: int = 1024) -> di.Record:
 
 
 def scenarios() -> list[Scenario]:
-    """Return every scenario: both kinds, white and coloured noise, noise of the displacement."""
+    """Return every scenario: kind, noise, noise of the displacement, exponent not stated."""
     found = []
     spring = {"f_max": 0.1, "sigma": 30.0, "stiffness": 5.0}
     plant = {"f_max": 0.1, "sigma": 300.0, "mass": 0.3, "damping": 0.5, "stiffness": 50.0}
@@ -100,14 +105,24 @@ def scenarios() -> list[Scenario]:
                 partial(force_record, pole=0.0, travel_noise=travel, travel_pole=pole), False,
             )
         )  # fmt: skip
+    for pole, alpha in ((0.0, 0.8), (0.9, 1.3)):
+        noise = f"correlation {pole}" if pole else "white noise"
+        found.append(
+            Scenario(
+                f"force from displacement, {noise}; exponent {alpha}, not stated",
+                di.Dahl() + di.Spring(), {**spring, "alpha": alpha},
+                partial(force_record, pole=pole, alpha=alpha), False,
+            )
+        )  # fmt: skip
     return found
 
 
 def coverage(scenario: Scenario, records: int) -> dict[str, float]:
     """Return the share of records whose 95.45 % interval holds the truth, by parameter."""
     inside = dict.fromkeys(scenario.truth, 0)
+    start = {name: value for name, value in scenario.truth.items() if name != "alpha"}
     for seed in range(records):
-        fit = di.fit(scenario.record(seed), scenario.model, start=scenario.truth, throw=False)
+        fit = di.fit(scenario.record(seed), scenario.model, start=start, throw=False)
         within = fit.conf_interval(levels=CONFIDENCE).at(CONFIDENCE)
         for name, value in scenario.truth.items():
             inside[name] += within[name].lower < value < within[name].upper
