@@ -69,13 +69,7 @@ def problem_of(
     """Return the problem of a table, also as a pandas DataFrame, of one record or of several."""
     if problem_class(data) is TableProblem:
         table = data if isinstance(data, FrequencyResponse) else read_frequency_response(data)
-        if not (table.harmonic == 1).any():
-            orders = ", ".join(map(str, np.unique(table.harmonic)))
-            raise DataError(
-                f"the table has rows of harmonic {orders} alone; expected rows of the fundamental, "
-                "harmonic 1, too, with which the others are weighted: extract or add them"
-            )
-        return TableProblem(
+        problem = TableProblem(
             without_copies(table),
             model,
             noise=noise,
@@ -84,6 +78,13 @@ def problem_of(
             fixed=fixed,
             steady=steady,
         )
+        if not (table.harmonic == 1).any():
+            orders = ", ".join(map(str, np.unique(table.harmonic)))
+            raise DataError(
+                f"the table has rows of harmonic {orders} alone; expected rows of the fundamental, "
+                "harmonic 1, too, with which the others are weighted: extract or add them"
+            )
+        return problem
     changed, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
     is_one = isinstance(data, Record) or not isinstance(data, Iterable)
     return RecordProblem(
