@@ -423,8 +423,6 @@ def row(**columns):
          "every response is 0; there is nothing to estimate from"),
         (data(), FREE, {"free": "alpha"}, ValidationError,
          r"free is 'alpha'; expected a collection of names: \['alpha'\]"),
-        (data(), FREE, {"free": {"mass": 0.3}}, ValidationError,
-         "expected a collection of names"),
         (data(), FREE, {"fixed": ["mass"]}, ValidationError,
          r"fixed is \['mass'\]; expected a mapping of names to numbers"),
         (data(), FREE, {"sensors": {"delay": 1e-3}}, ValidationError,

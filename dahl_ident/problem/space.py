@@ -209,7 +209,7 @@ def with_changes(
     """Free and fix parameters by name, in the model and the sensors."""
     if not isinstance(sensors, Sensors):
         raise ValidationError(f"sensors is {sensors!r}; expected Sensors(...)")
-    if isinstance(free, (str, Mapping)) or not isinstance(free, Iterable):
+    if isinstance(free, str) or not isinstance(free, Iterable):
         raise ValidationError(f"free is {free!r}; expected a collection of names: ['{free}']")
     if not isinstance(fixed, Mapping):
         raise ValidationError(

@@ -299,7 +299,7 @@ class TableProblem(Problem):
 
         They scatter about their values.
         """
-        freed = self.like(free=tuple(spread))
+        freed = self.like(free=spread)
         values = {p.name: p.value or 1.0 for p in freed.parameters}
         freed.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
         return freed

@@ -528,7 +528,7 @@ def _density(
         values = None if optimum is None else optimum.values
         return Density(problem, joint_prior(problem, stated, values), likelihood), optimum
     _, assumed = with_assumed(problem)
-    wider = problem.like(free=tuple(assumed)) if assumed else problem
+    wider = problem.like(free=assumed) if assumed else problem
     errors = fit.errors_of_combinations
     theta = optimum.theta_in(wider) if errors is None else errors.theta
     ranges = {p.name: p.prior for p in wider.parameters if p.prior is not None}
