@@ -333,10 +333,12 @@ def record_errors(
         sources[MODEL_ERROR] = exact.between_blocks
     if (scatter := between_records(fit)) is not None:
         sources[RUNS] = scatter
-    sources |= dict(by_motion(exact))
+    of_motion = dict(by_motion(exact))
+    sources |= of_motion
     known = np.asarray(sum(sources.values()))
     if assumed:
-        sources[EXPONENT] = by_exponents(fit, exact, by_motion)
+        with_exact = np.asarray(sum([exact.covariance(), *of_motion.values()]))
+        sources[EXPONENT] = by_exponents(fit, with_exact, by_motion)
     if misfit is not None:
         along_motion = misfit.covariance(fit)
         larger = along_motion.diagonal() > _SHORTENS**2 * known.diagonal()

@@ -177,9 +177,9 @@ class LinearFit:
         return np.asarray(max(change**2 - variance, 0.0) * np.outer(line, line))
 
 
-def by_exponents(fit: LinearFit, exact: LinearFit, sources: Sources) -> FloatArray:
+def by_exponents(fit: LinearFit, exact: FloatArray, sources: Sources) -> FloatArray:
     """Return the covariance due to assumed exponents, (Q, Q), in excess of that of `exact` ones."""
-    covariance = excess(fit.covariance(sources), exact.covariance(sources))
+    covariance = excess(fit.covariance(sources), exact)
     for i in np.flatnonzero(np.isfinite(fit.unmeasured)).tolist():
         low, high = fit.problem.parameters[i].prior or (0.0, np.inf)
         covariance += fit.shifted(i, (low - fit.values[i], high - fit.values[i]))
